@@ -46,7 +46,7 @@ def problem_of(layout: dict[str, int]) -> tuple[Problem, State]:
         loss_R=1e6,
         free=np.array([[1, 0, 0, 1, 1, 0, 0, 0, 0, 0]], bool),
         sigma_R=np.full((n, 3), np.inf),
-        sigma_K=np.full((1, 10), np.inf),
+        sigma_K=np.full((1, 11), np.inf),
     )
     start = replace(
         block.start,

@@ -29,6 +29,7 @@ from tests.alignment.test_bundle import FRAME, Flown  # noqa: E402
 
 from skyquilt.alignment.bundle import Bundle  # noqa: E402
 from skyquilt.alignment.control import MARKED_PX, Control  # noqa: E402
+from skyquilt.alignment.problem import READOUT  # noqa: E402
 from skyquilt.engine.clock import Clock, result_of  # noqa: E402
 from skyquilt.engine.store import Store  # noqa: E402
 from skyquilt.model.camera import PARAMETERS, Camera  # noqa: E402
@@ -43,7 +44,7 @@ from skyquilt.workflows.flow import align_photos  # noqa: E402
 from skyquilt.workflows.methods import methods_for  # noqa: E402
 from skyquilt.workflows.survey_input import read_input  # noqa: E402
 
-SIGMA_K = np.array([8.0, 4.0, 4.0, 0.02, 0.02, 0.01, 1e-3, 1e-3, 2e-3, 1e-9])
+SIGMA_K = np.array([8.0, 4.0, 4.0, 0.02, 0.02, 0.01, 1e-3, 1e-3, 2e-3, 1.0, 1e-9])
 KINDS = {
     "control": ({"gps": 2.0}, True),
     "block": ({"gps": 2.0}, False),
@@ -62,14 +63,14 @@ class Drawn(Flown):
     """A flight whose lens and angles err by the deviations that are stated for them."""
 
     def __init__(self, seed: int, noise: float, **options) -> None:
-        free = np.array([1, 1, 1, 1, 1, 1, 1, 1, 1, 0], bool)
+        free = np.array([1, 1, 1, 1, 1, 1, 1, 1, 1, 0, 0], bool)
         options = {"sigma_k": SIGMA_K, "free": free, "lens": LENS, **options}
         super().__init__(seed, noise=noise, tilt_deg=TILT_DEG, yaw_deg=YAW_DEG, **options)
         self.priors = [
             replace(p, sigma_tilt_deg=TILT_DEG, sigma_yaw_deg=YAW_DEG) for p in self.priors
         ]
-        names = dict(zip(PARAMETERS, LENS[:9].tolist(), strict=True))
-        told = Camera(width=800, height=600, sigmas=tuple(SIGMA_K[:9].tolist()), **names)
+        names = dict(zip(PARAMETERS, LENS[:READOUT].tolist(), strict=True))
+        told = Camera(width=800, height=600, sigmas=tuple(SIGMA_K[:READOUT].tolist()), **names)
         self.photos = [
             replace(p, calibration=told, focal=replace(p.focal, sigma_px=float(SIGMA_K[0])))
             for p in self.photos

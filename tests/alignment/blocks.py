@@ -6,13 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from skyquilt.alignment.problem import Problem, State
+from skyquilt.alignment.problem import CAMERA, Problem, State
+from skyquilt.alignment.setup import FISHEYE
 from skyquilt.geometry.frames import cam_R_map_from_angles, rotation_from_vector
 
 WIDTH, HEIGHT, FOCAL, FLYING = 800, 600, 700.0, 60.0
-LENS = np.array([FOCAL, 402.0, 297.0, -0.06, 0.03, 0.0, 0.0, 0.0, 1.0, 0.0])
-FREE = np.array([1, 1, 1, 1, 1, 0, 0, 0, 0, 0], bool)
-SIGMA_K = np.array([10.0, 3.0, 3.0, 0.02, 0.02, 0.01, 1e-3, 1e-3, 3e-3, 1e-3])
+LENS = np.array([FOCAL, 402.0, 297.0, -0.06, 0.03, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
+FREE = np.array([1, 1, 1, 1, 1, 0, 0, 0, 0, 0, 0], bool)
+SIGMA_K = np.array([10.0, 3.0, 3.0, 0.02, 0.02, 0.01, 1e-3, 1e-3, 3e-3, 1.0, 1e-3])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +89,10 @@ def make_block(
     X = np.column_stack([X, ground(X)])
     camera = np.arange(n) % cameras
     K0 = np.tile(lens, (cameras, 1))
-    K = K0 + (rng.normal(0, 1, K0.shape) * sigma_k * free if lens_errs else 0)
+    K = K0.copy()
+    if lens_errs:
+        drawn = rng.normal(0, 1, (len(K0), CAMERA - 1))
+        K += np.insert(drawn, FISHEYE, 0.0, axis=1) * sigma_k * free
     parts = []
     for i in range(n):
         px = seen_by(R[i], C[i], K[camera[i]], X)

@@ -15,7 +15,7 @@ pytest.importorskip("pycolmap")
 from tests.alignment import ceres
 
 NOTHING = np.inf
-FIXED = (0,) * 10
+FIXED = (0,) * 11
 
 
 def both(seed, *, free, cauchy=None, lies=0.0, **ceres_options):
@@ -25,7 +25,7 @@ def both(seed, *, free, cauchy=None, lies=0.0, **ceres_options):
         sigma_px=np.ones(len(block.problem.px)),
         free=np.array([free], bool),
         sigma_R=np.full(block.problem.sigma_R.shape, NOTHING),
-        sigma_K=np.full((1, 10), NOTHING),
+        sigma_K=np.full((1, 11), NOTHING),
     )
     if cauchy is not None:
         problem = replace(problem, loss_px=cauchy)

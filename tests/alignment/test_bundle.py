@@ -10,6 +10,7 @@ from pyproj import Transformer
 from skyquilt.alignment.aligners import blank_notes, choose_method
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.control import Control, control_in_frame, fit_similarity_3d
+from skyquilt.alignment.problem import READOUT
 from skyquilt.alignment.setup import HALF_TURN
 from skyquilt.alignment.stages import position_noise, prune
 from skyquilt.engine.codec import decode, encode
@@ -34,7 +35,7 @@ class Flown:
     """A simulated block as photos, priors, features and links."""
 
     def __init__(self, seed=0, *, turned=(), yaw_lies=(), gps=1.0, **options):
-        sigma_k = np.array([4.0, 2.0, 2.0, 0.01, 0.01, 0.01, 1e-3, 1e-3, 3e-3, 1e-3])
+        sigma_k = np.array([4.0, 2.0, 2.0, 0.01, 0.01, 0.01, 1e-3, 1e-3, 3e-3, 1.0, 1e-3])
         options = {"points": 500, "tilt_deg": 0.5, "sigma_k": sigma_k} | options
         self.block = b = make_block(seed, gps=gps, **options)
         n = len(b.truth.C)
@@ -441,7 +442,7 @@ def lens_errors(*, noise, control=False):
     for seed in range(10, 22):
         flown = Flown(seed, noise=noise)
         (camera,) = flown.aligned(control=surveyed(flown) if control else ()).cameras.values()
-        errors.append((camera.vector - flown.truth.K[0, :9])[:5] / camera.sigmas[:5])
+        errors.append((camera.vector - flown.truth.K[0, :READOUT])[:5] / camera.sigmas[:5])
     return np.array(errors)
 
 

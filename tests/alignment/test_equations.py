@@ -9,7 +9,7 @@ from skyquilt.alignment import equations
 from skyquilt.alignment.adjust import adjust
 from skyquilt.alignment.eliminated_points import points_inverse, points_step, polish_points
 from skyquilt.alignment.equations import Equations, NearFactor
-from skyquilt.alignment.problem import linearise
+from skyquilt.alignment.problem import CAMERA, linearise
 from skyquilt.alignment.robust import observation_weights, prior_terms, robust_cost
 from skyquilt.engine.kept import Keep
 from skyquilt.engine.workers import HERE, Threads
@@ -44,21 +44,21 @@ def test_the_step_of_all_unknowns_solves_the_whole_equations(options):
     lin = linearise(problem, state)
     weight, _ = observation_weights(problem, lin.residual)
     n, m, P = len(state.C), len(state.K), len(state.X)
-    J = np.zeros((len(problem.px), 2, 6 * n + 10 * m + 3 * P))
+    J = np.zeros((len(problem.px), 2, 6 * n + CAMERA * m + 3 * P))
     row = np.arange(len(J))
     for k in range(6):
         J[row, :, 6 * problem.photo + k] = lin.J_photo[:, :, k]
-    for k in range(10):
-        J[row, :, 6 * n + 10 * problem.camera[problem.photo] + k] = lin.J_camera[:, :, k]
+    for k in range(CAMERA):
+        J[row, :, 6 * n + CAMERA * problem.camera[problem.photo] + k] = lin.J_camera[:, :, k]
     for k in range(3):
-        J[row, :, 6 * n + 10 * m + 3 * problem.point + k] = lin.J_point[:, :, k]
+        J[row, :, 6 * n + CAMERA * m + 3 * problem.point + k] = lin.J_point[:, :, k]
     J, w = J.reshape(2 * len(J), -1), np.repeat(weight, 2)
     H, g = (J * w[:, None]).T @ J, J.T @ (w * lin.residual.ravel())
     priors = prior_terms(problem, state)
     fixed = np.where(problem.free, priors.camera, 1.0)
-    H[np.diag_indices(6 * n + 10 * m)] += np.r_[priors.photo[:, :6].ravel(), fixed.ravel()]
+    H[np.diag_indices(6 * n + CAMERA * m)] += np.r_[priors.photo[:, :6].ravel(), fixed.ravel()]
     g[: 6 * n] += priors.photo_gradient[:, :6].ravel()
-    g[6 * n : 6 * n + 10 * m] += priors.camera_gradient.ravel()
+    g[6 * n : 6 * n + CAMERA * m] += priors.camera_gradient.ravel()
     H[np.diag_indices(len(H))] *= 1 + damping
     found = np.concatenate([photos.ravel(), cameras.ravel(), points.ravel()])
     assert np.abs(found).max() > 0.1

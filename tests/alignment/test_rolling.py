@@ -11,7 +11,8 @@ import pytest
 from skyquilt.alignment import stages
 from skyquilt.alignment.adjust import adjust, covariance
 from skyquilt.alignment.motion import velocities
-from skyquilt.alignment.problem import READOUT, Problem, State, residuals_px
+from skyquilt.alignment.problem import CAMERA, READOUT, Problem, State, residuals_px
+from skyquilt.alignment.setup import FISHEYE
 from skyquilt.alignment.triangulate import polish, triangulated
 from skyquilt.imaging.nodes import View, project_all, project_nodes
 from skyquilt.imaging.views import on_ground
@@ -35,7 +36,7 @@ def shots(seed=0, *, fixed_yaw=True, turns=0.0, photos=24, lens=LENS):
 
 
 def vector(lens):
-    terms = (lens.k1, lens.k2, lens.k3, lens.p1, lens.p2, lens.aspect, lens.readout)
+    terms = (lens.k1, lens.k2, lens.k3, lens.p1, lens.p2, lens.aspect, 0.0, lens.readout)
     return np.array([lens.focal, lens.cx, lens.cy, *terms])
 
 
@@ -57,6 +58,7 @@ def block(seed=0, *, noise=0.1, lens=LENS, **options):
     used, point = np.unique(point[keep], return_inverse=True)
     photos, px = photos[keep], px[keep] + rng.normal(0, noise, (int(keep.sum()), 2))
     n, sigma_K = len(flown), [13.0, 8, 8, 0.02, 0.02, 0.01, 2e-3, 2e-3, 3e-3, 0.015]
+    errs = np.insert(rng.normal(0, sigma_K) * (noise > 0), FISHEYE, 0.0)
     spins = np.radians([s.spin for s in flown]) * lens.readout
     R = np.array([s.rotation for s in flown])
     truth = State(R=R, C=C, K=vector(lens)[None], X=X[used], turn=spins)
@@ -66,9 +68,9 @@ def block(seed=0, *, noise=0.1, lens=LENS, **options):
         px=px,
         sigma_px=np.full(len(px), max(noise, 0.05)),
         camera=np.zeros(n, int),
-        free=np.ones((1, 10), bool),
-        K0=vector(lens)[None] + rng.normal(0, sigma_K) * (noise > 0),
-        sigma_K=np.array([sigma_K]),
+        free=np.array([np.arange(CAMERA) != FISHEYE]),
+        K0=vector(lens)[None] + errs,
+        sigma_K=np.insert(sigma_K, FISHEYE, 1.0)[None],
         C0=C + rng.normal(0, 1.0, C.shape) * (noise > 0),
         sigma_C=np.full(C.shape, 1.0),
         R0=R,
@@ -89,7 +91,7 @@ def test_residuals_are_those_of_a_camera_that_moves_while_it_reads(turns):
     problem, truth, _ = block(noise=0.0, turns=turns)
     off = np.abs(residuals_px(problem, truth)).max()
     assert off < (1e-6 if turns == 0 else 0.02)  # turns enter linearly
-    still = replace(truth, K=np.where(np.arange(10) == READOUT, 0.0, truth.K))
+    still = replace(truth, K=np.where(np.arange(CAMERA) == READOUT, 0.0, truth.K))
     assert np.abs(residuals_px(problem, still)).max() > 4.0  # the readout shifts rows by 5 px
 
 
@@ -118,8 +120,8 @@ def test_a_drone_that_turns_with_its_lines_leaves_readout_and_aspect_to_their_pr
     start = replace(truth, C=problem.C0, K=problem.K0.copy())
     found = adjust(problem, start, iterations=40, tolerance=1e-9).state
     full = covariance(problem, found)
-    shape, sigma = full.camera_sigmas[0, -2:]
-    assert full.cameras[-1, -2] / sigma / shape < -0.6  # one makes up for the other
+    shape, _, sigma = full.camera_sigmas[0, -3:]
+    assert full.cameras[-1, -3] / sigma / shape < -0.6  # one makes up for the other
     other, truth, _ = block(fixed_yaw=True)
     start = replace(truth, C=other.C0, K=other.K0.copy())
     found = adjust(other, start, iterations=40, tolerance=1e-9).state
@@ -168,7 +170,7 @@ def test_some_photos_of_a_large_survey_tell_whether_its_cameras_stood_still(monk
     """
     problem, truth, _ = block(lens=replace(LENS, readout=0.0) if stops else LENS)
     if stops:
-        problem = replace(problem, sigma_K=np.where(np.arange(10) == READOUT, 1e-4, 1.0))
+        problem = replace(problem, sigma_K=np.where(np.arange(CAMERA) == READOUT, 1e-4, 1.0))
         problem.K0[:, READOUT] = LENS.readout  # what is usual for this model
     whole, asked = len(truth.C), []
     start = adjust(problem, replace(truth, K=problem.K0.copy()), iterations=40).state

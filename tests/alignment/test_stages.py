@@ -13,7 +13,7 @@ from skyquilt.alignment.robust import robust_cost
 from skyquilt.engine.kept import Keep
 from tests.alignment.blocks import make_block
 
-WIDE = np.array([40.0, 15.0, 15.0, 0.15, 0.1, 0.01, 1e-3, 1e-3, 3e-3, 1e-3])
+WIDE = np.array([40.0, 15.0, 15.0, 0.15, 0.1, 0.01, 1e-3, 1e-3, 3e-3, 1.0, 1e-3])
 """Deviations of a lens of which little is known."""
 
 

@@ -10,10 +10,10 @@ from tests.alignment.blocks import LENS
 from tests.alignment.test_bundle import Flown, assert_residuals_fit, relative_error, worst_turn_deg
 
 LINE = range(6, 12)
-ASIDE = LENS + [0, 5.5, -7.3, 0, 0, 0, 8e-4, -8e-4, 0, 0]
+ASIDE = LENS + [0, 5.5, -7.3, 0, 0, 0, 8e-4, -8e-4, 0, 0, 0]
 """A lens whose axis lies one hundredth of the picture beside its middle, as of small cameras."""
 
-MIDDLE = LENS + [0, -2.5, 2.5, 0, 0, 0, 0, 0, 0, 0]
+MIDDLE = LENS + [0, -2.5, 2.5, 0, 0, 0, 0, 0, 0, 0, 0]
 
 
 def silent(rewritten=None, turned=(), **options):

@@ -106,4 +106,4 @@ def test_a_focal_length_needs_few_views():
         replace(SETTINGS, weights="phi")
     with pytest.raises(ValueError, match="one size"):
         LOOSE([], BOARD)
-    assert len(PARAMETERS) == 9
+    assert len(ADJUSTABLE) == 9

@@ -2,9 +2,11 @@ import csv
 import math
 from importlib.resources import files
 
+import numpy as np
 import piexif
 import pytest
 
+from skyquilt.geometry.camera import project
 from skyquilt.photos.lens import _table, find_sensor
 from skyquilt.photos.read import read_photo
 
@@ -166,6 +168,51 @@ def test_pix4d_lens_model_in_mm(make_jpeg):
     camera = read_photo(make_jpeg(image=pixels(120, 90), exif=exif, xmp=xmp)).calibration
     assert camera.focal == pytest.approx(5.5 * 25)
     assert (camera.cx, camera.cy, camera.p2) == (pytest.approx(59.5), pytest.approx(44.5), 0.002)
+
+
+def fisheye_xmp(matrix="1600,0,0,1604", polynomial="0,1,0.02,-0.11"):
+    model = (
+        'xmlns:Camera="http://pix4d.com/camera/1.0/" Camera:ModelType="fisheye" '
+        f'Camera:PrincipalPoint="2.45,1.8" Camera:FisheyeAffineMatrix="{matrix}" '
+        f'Camera:FisheyePolynomial="{polynomial}"'
+    )
+    return dji_xmp().replace("xmlns:drone-dji", model + " xmlns:drone-dji")
+
+
+def test_pix4d_fisheye(make_jpeg):
+    """x = C rho(t) cos, y = F rho(t) sin, t the angle from the axis over a right angle."""
+    exif = exif_of("Sequoia", FocalPlaneXResolution=(266, 1), FocalPlaneResolutionUnit=4)
+    image = pixels(1280, 960)
+    camera = read_photo(make_jpeg(image=image, exif=exif, xmp=fisheye_xmp())).calibration
+    assert camera.fisheye == 1.0
+    assert (camera.cx, camera.cy) == (pytest.approx(2.45 * 266 - 0.5), pytest.approx(478.3))
+    angle, turn = (g.ravel() for g in np.meshgrid(np.linspace(0.01, 0.7, 30), (0.3, 2.0, 4.5)))
+    t = angle * 2 / np.pi
+    rho = t + 0.02 * t**2 - 0.11 * t**3
+    theirs = np.column_stack([1600 * rho * np.cos(turn), 1604 * rho * np.sin(turn)])
+    xyz = np.column_stack(
+        [np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)]
+    )
+    ours = project(camera, xyz) - (camera.cx, camera.cy)
+    assert np.abs(ours - theirs).max() < 0.3  # px: odd powers stand for the even one
+
+
+@pytest.mark.parametrize(
+    ("matrix", "polynomial", "word"),
+    [
+        ("0,0,0,1600", "0,1,0,0", "affine matrix"),
+        ("nan,0,0,1600", "0,1,0,0", "affine matrix"),
+        ("1600,0,0,1600", "0,-1,0,0", "polynomial"),
+        ("16,0,0,16", "0,1,0,0", "focal length"),
+        ("1600,0,0,2600", "0,1,0,0", "differ"),
+        ("1600,0,0,1600", "0,1,0,1e9", "distortion"),
+    ],
+)
+def test_a_fisheye_that_no_lens_can_be_is_told(make_jpeg, matrix, polynomial, word):
+    xmp = fisheye_xmp(matrix, polynomial)
+    photo = read_photo(make_jpeg(image=pixels(1280, 960), exif=exif_of("Nothing"), xmp=xmp))
+    assert photo.calibration is None
+    assert word in photo.unusable_calibration
 
 
 def test_sensor_table_is_sane():

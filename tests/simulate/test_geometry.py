@@ -1,9 +1,12 @@
 """Photos, poses and lenses agree with each other, and with the project's conventions."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
+from skyquilt.errors import UsageError
 from skyquilt.geometry.frames import belly_from_gimbal, cam_R_map_from_angles
 from skyquilt.simulate.camera import Lens, camera_rotation, gimbal_angles
 from skyquilt.simulate.expose import exposer
@@ -71,6 +74,33 @@ def test_discs_are_where_opencv_projects_them():
     assert len(errors) >= 15
     assert np.abs(errors).max() < 0.1
     assert np.abs(errors.mean(axis=0)).max() < 0.03
+
+
+@pytest.mark.parametrize("degrees", [84.0, 118.0, 149.0])
+def test_a_fisheye_is_opencv_s_and_its_rays_are_the_inverse(degrees):
+    lens = replace(LENS, fisheye=True, p1=0.0, p2=0.0).seeing(degrees)
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-2.5, 2.5, (200, 2)), np.ones(200)])
+    matrix = np.array([[lens.focal, 0, lens.cx], [0, lens.focal, lens.cy], [0, 0, 1]])
+    bend = np.array([lens.k1, lens.k2, lens.k3, 0.0])
+    theirs = cv2.fisheye.projectPoints(points[None], np.zeros(3), np.zeros(3), matrix, bend)[0][0]
+    assert lens.project(points, np.eye(3), np.zeros(3)) == pytest.approx(theirs, abs=1e-9)
+    rays = lens.rays()[::60, ::60].reshape(-1, 2).astype(float)
+    back = lens.project(np.column_stack([rays, np.ones(len(rays))]), np.eye(3), np.zeros(3))
+    y, x = np.mgrid[0 : lens.height : 60, 0 : lens.width : 60]
+    assert back == pytest.approx(np.column_stack([x.ravel(), y.ravel()]), abs=0.01)
+
+
+@pytest.mark.parametrize("fisheye", [False, True])
+def test_the_field_of_view_is_that_of_the_diagonal(fisheye):
+    lens = replace(LENS, fisheye=fisheye, k1=0.0, k2=0.0, p1=0.0, p2=0.0).seeing(100.0)
+    corner = (np.array([lens.width, lens.height]) / 2) / lens.focal
+    x, y = lens.undistort(*(corner[:, None]))
+    assert 2 * np.degrees(np.arctan(np.hypot(x, y)))[0] == pytest.approx(100.0)
+    wide, _ = lens.undistort(np.array([corner[0]]), np.zeros(1))
+    assert lens.extent[0] == pytest.approx(2 * wide[0])
+    with pytest.raises(UsageError, match="field of view"):
+        lens.seeing(170.0)
 
 
 def test_first_hits_equal_a_patient_march(tmp_path):

@@ -30,14 +30,17 @@ LOOKED_AT = 8
 FEWEST = 3
 """Links that can tell the kind of a lens."""
 SUSPECT = 0.9
-"""Residuals as a fisheye over those as a pinhole, in the median of links, below which both are
-tried: 0.2 to 0.4 for a fisheye over level ground, 0.6 to 0.8 over relief of a seventh of the
-height, and above 1 for a pinhole.
+"""Residuals from homographies as a fisheye over those as a pinhole, in the median of links, below
+which matches are counted; above it a lens is a pinhole's, whose ratios are above 1.
+"""
+EVIDENT = 0.6
+"""The same below which nothing else is asked: 0.2 to 0.5 is usual for fisheyes, and over relief of
+a seventh of the height 0.6 to 0.8. Pinholes with as much distortion as a fisheye come below it too,
+and are no worse as fisheyes.
 """
 MORE = 1.06
-"""So many times as many matches must agree with a fisheye: 1.08 to 1.3 times as many do for
-fisheyes of 118 to 153 degrees, at most as many for pinholes, those with much distortion too
-(simulated matches, a fifth of them false).
+"""So many times as many matches must agree with a fisheye: 1.04 to 1.3 times as many do for
+fisheyes of 118 to 153 degrees, at most as many for pinholes.
 """
 CERTAIN = 20
 """And at least so many more."""
@@ -47,6 +50,8 @@ equivalents of fisheyes are given by the field of view as well as by the focal l
 """
 SIGMA_FOCAL = 0.15
 """Relative deviation of the focal length after that."""
+COUNTED_PX = 1.0
+"""Tolerance of the matches that are counted, in px of the picture that was searched."""
 TOLERANCE_PX = 2.0
 """Of matches that agree, in px of the picture that was searched for features: lenses that are taken
 for those of a kind differ from it.
@@ -117,16 +122,13 @@ class FoundFisheye:
     """Its key."""
     multiple: float
     """Its focal length over the reported one, roughly."""
-    agreeing: tuple[int, int]
-    """Matches that agree with a fisheye, and with a pinhole."""
 
     @property
     def note(self) -> str:
         """What a user should know."""
-        fisheye, pinhole = self.agreeing
         return (
-            f"{self.camera} has a fisheye: {fisheye} matches of some pairs agree with one,"
-            f" {pinhole} with a pinhole. Its lens is adjusted as a fisheye's."
+            f"The lens of {self.camera} is a fisheye's, as its photos show where they overlap; it"
+            " is adjusted as one."
         )
 
 
@@ -152,7 +154,10 @@ def fisheyes(
             pairs = [inside[n] for n in _spread(len(inside))]
         else:
             some = [linked[n] for n in _spread(len(linked))]
-            if not _suspect(photos[min(own)], features, some):
+            straighter, multiple = _straighter(photos[min(own)], features, some)
+            if straighter < EVIDENT:
+                yield FoundFisheye(camera=key, multiple=multiple)
+            if not EVIDENT <= straighter < SUSPECT:
                 continue
             pairs = [(k.a, k.b) for k in some]
         scale = features[min(own)].scale
@@ -166,16 +171,22 @@ def _spread(count: int) -> list[int]:
     return [int(n) for n in np.unique(where)]
 
 
-def _suspect(photo: Photo, features: Sequence[Features], links: Iterable[Link]) -> bool:
-    """Whether matches of links are more nearly a homography when read as a fisheye's."""
+def _straighter(
+    photo: Photo, features: Sequence[Features], links: Iterable[Link]
+) -> tuple[float, float]:
+    """Residuals of matches from a homography when read as a fisheye's, over those as a pinhole's,
+    in the median of links; and the multiple of the focal length for which they are least.
+    """
+    bent = [c for c in (as_fisheye(photo, m).calibration for m in FOCALS) if c is not None]
     ratios = []
     for link in links:
         a, b = features[link.a].px[link.index_a], features[link.b].px[link.index_b]
-        plain = _residual(a, b)
-        bent = [as_fisheye(photo, m).calibration for m in FOCALS]
-        best = min(_residual(straight(c, a), straight(c, b)) / _stretch(c, b) for c in bent if c)
-        ratios.append(best / max(plain, 1e-9))
-    return bool(ratios) and float(np.median(ratios)) < SUSPECT
+        plain = max(_residual(a, b), 1e-9)
+        ratios.append(
+            [_residual(straight(c, a), straight(c, b)) / _stretch(c, b) / plain for c in bent]
+        )
+    least = np.median(ratios, axis=0)
+    return float(least.min()), FOCALS[int(least.argmin())]
 
 
 def _residual(a: Px, b: Px) -> float:
@@ -201,7 +212,7 @@ def _judged(photo: Photo, pairs: Sequence[tuple[Px, Px]], scale: float) -> Found
     """
 
     def count(camera: Camera) -> int:
-        tolerance = TOLERANCE_PX * scale / camera.focal
+        tolerance = COUNTED_PX * scale / camera.focal
         return sum(int(agreeing(unit_rays(camera, a), unit_rays(camera, b), tolerance).sum())
                    for a, b in pairs)  # fmt: skip
 
@@ -211,7 +222,7 @@ def _judged(photo: Photo, pairs: Sequence[tuple[Px, Px]], scale: float) -> Found
     fisheye, pinhole = counts[best][0], max(n for _, n in counts.values())
     if fisheye < max(MORE * pinhole, pinhole + CERTAIN):
         return None
-    return FoundFisheye(camera=photo.camera_key, multiple=best, agreeing=(fisheye, pinhole))
+    return FoundFisheye(camera=photo.camera_key, multiple=best)
 
 
 def unit_rays(camera: Camera, px: Px) -> Px:

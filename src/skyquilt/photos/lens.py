@@ -13,6 +13,7 @@ import numpy as np
 
 from skyquilt.model.camera import ADJUSTABLE, Camera
 from skyquilt.model.photo import Focal
+from skyquilt.outside import plain
 from skyquilt.photos import tags as tag
 from skyquilt.photos.tags import Exif, Xmp
 
@@ -371,10 +372,11 @@ def _fisheye(
     axis over a right angle.
     """
     matrix, rho = (xmp.numbers(f"Camera:Fisheye{n}") for n in ("AffineMatrix", "Polynomial"))
-    if xmp.text("Camera:ModelType").lower() != "fisheye" or len(matrix) != 4:
+    written = xmp.text("Camera:FisheyeAffineMatrix")
+    if xmp.text("Camera:ModelType").lower() != "fisheye" or not written:
         return None
-    if not (matrix[0] > 0 and matrix[3] > 0 and all(math.isfinite(n) for n in (*matrix, *rho))):
-        return f"an affine matrix of {', '.join(f'{n:.4g}' for n in matrix)}"
+    if len(matrix) != 4 or not (matrix[0] > 0 and matrix[3] > 0 and all(map(math.isfinite, rho))):
+        return f"an affine matrix of {plain(written, 60)}"
     px_per_mm = _px_per_mm(exif, sensor, size)
     middle = (size[0] / 2, size[1] / 2)
     centre = middle if px_per_mm is None else _principal_point(xmp, px_per_mm, size)
