@@ -10,7 +10,7 @@ import tifffile
 from skyquilt.calibration.few_views import FREE, FewViews, cannot_know
 from skyquilt.calibration.workflow import CalibrateSettings, calibrate
 from skyquilt.errors import RefusedError, UsageError
-from skyquilt.model.camera import PARAMETERS
+from skyquilt.model.camera import ADJUSTABLE
 from skyquilt.simulate.board import Lamp, Sensor, sweep, tilted
 from tests.calibration.boards import BOARD, CAMERA, CHESS, LENS, frontal, poses
 from tests.calibration.test_calibrate import pose_of, view

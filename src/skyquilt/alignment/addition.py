@@ -18,7 +18,6 @@ from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.local_adjustment import LocalAdjustment, NotAdjusted
 from skyquilt.alignment.near_new import Block, adjusted_near, ground_near, window_of
 from skyquilt.alignment.oblique import OBLIQUE_DEG, hung, reported_oblique, tilt_deg
-from skyquilt.alignment.pose import reported_camera
 from skyquilt.model.features import Link
 from skyquilt.model.poses import Alignment, Pose, Prior, TiePoints
 
@@ -157,7 +156,7 @@ def _know(block: Block, inputs: AlignmentInputs, photo: int) -> None:
     """Enters the calibration of a photo just placed where it is new."""
     name, key = block.camera_of[photo], inputs.photos[photo].camera_key
     if name not in block.cameras:
-        own = block.cameras.get(key) or reported_camera(inputs.photos[photo])
+        own = block.cameras.get(key) or inputs.photos[photo].lens
         block.cameras[name] = own if name == key else own.mirrored()
 
 

@@ -15,7 +15,7 @@ from skyquilt.alignment.crowded_positions import without_crowded
 from skyquilt.alignment.determined import ground_places
 from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.oblique import tilted
-from skyquilt.alignment.pose import ByMetadata, ByPose, reported_camera
+from skyquilt.alignment.pose import ByMetadata, ByPose
 from skyquilt.alignment.repair import Repaired, repair
 from skyquilt.alignment.start import ground_of
 from skyquilt.errors import AlignmentError
@@ -225,13 +225,13 @@ def with_loose_photos(alignment: Alignment, inputs: AlignmentInputs) -> Alignmen
             continue
         weak = rejected.pop(i, "it could not be linked to any other photo")
         R = cam_R_map_from_angles(priors[i].yaw_deg, priors[i].pitch_deg, priors[i].roll_deg)
-        if shown_already(Pose(cam_R_map=R, map_C=C), reported_camera(photo), alignment):
+        if shown_already(Pose(cam_R_map=R, map_C=C), photo.lens, alignment):
             rejected[i] = (
                 f"{weak}, and what it would show by its metadata is shown by photos that are"
             )
             continue
         poses[i] = Pose(cam_R_map=R, map_C=C)
-        cameras.setdefault(photo.camera_key, reported_camera(photo))
+        cameras.setdefault(photo.camera_key, photo.lens)
         camera_of[i] = photo.camera_key
         blocks.append((i,))
         notes.append(f"{photo.name} is placed by its metadata: {weak}.")

@@ -172,7 +172,7 @@ def similarity_of(window: Window, i: int) -> tuple[complex, complex]:
     pose, photo = window.poses[i], window.photos[i]
     centre = np.array([[(photo.width - 1) / 2, (photo.height - 1) / 2]])
     step = np.array([[photo.focal.px / 4, 0.0]])
-    camera = window.cameras.get(window.camera_of.get(i, "")) or _ideal(photo)
+    camera = window.cameras.get(window.camera_of.get(i, "")) or photo.lens
     direction = (
         rays(camera, np.concatenate([centre, centre + step, centre - step])) @ pose.cam_R_map
     )
@@ -183,10 +183,6 @@ def similarity_of(window: Window, i: int) -> tuple[complex, complex]:
     a = (z[1] - z[2]) / 0.5
     # for an ideal lens the centre has photo coordinates 0
     return complex(a), complex(z[0])
-
-
-def _ideal(photo: Photo) -> Camera:
-    return Camera.ideal(width=photo.width, height=photo.height, focal=photo.focal.px)
 
 
 def _guess(

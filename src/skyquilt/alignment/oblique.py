@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.determined import STATED_DEG, least_covered, why_weak, without
-from skyquilt.alignment.pose import reported_camera
 from skyquilt.geometry.camera import project, undistort
 from skyquilt.geometry.frames import cam_R_map_from_angles
 from skyquilt.geometry.neighbours import nearest
@@ -146,7 +145,7 @@ def _placed(
     least: float,
 ) -> Alignment:
     """The alignment with one more photo, or with the reason why it is left out."""
-    camera = alignment.cameras.get(about.camera_key, reported_camera(about))
+    camera = alignment.cameras.get(about.camera_key, about.lens)
     xyz = alignment.ties.xyz[point]
     pose, good = resected(camera, xyz, px, AGREE_PX * scale)
     if pose is None:

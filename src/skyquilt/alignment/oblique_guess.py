@@ -181,7 +181,9 @@ def _rays(
 def _local(photo: Photo, px: NDArray[np.floating]) -> Array:
     """(n, 3) unit vectors in camera coordinates, the lens's distortion neglected."""
     middle = np.array([photo.width - 1, photo.height - 1]) / 2
-    local = np.column_stack([(as_pinhole(photo, px) - middle) / photo.focal.px, np.ones(len(px))])
+    local = np.column_stack(
+        [(as_pinhole(photo.lens, px) - middle) / photo.focal.px, np.ones(len(px))]
+    )
     return np.asarray(local / np.linalg.norm(local, axis=1, keepdims=True))
 
 

@@ -9,18 +9,8 @@ from numpy.typing import NDArray
 
 from skyquilt.errors import AlignmentError
 from skyquilt.geometry.frames import cam_R_map_from_angles
-from skyquilt.model.camera import Camera
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, MapFrame, Pose, Prior, no_ties
-
-
-def reported_camera(photo: Photo) -> Camera:
-    """The calibration from metadata or a side file, otherwise an ideal camera with the reported
-    focal length.
-    """
-    if photo.calibration is not None:
-        return photo.calibration
-    return Camera.ideal(width=photo.width, height=photo.height, focal=photo.focal.px)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +55,7 @@ class ByMetadata:
             why="",
             frame=replace(frame, metric=frame.crs is not None or self.height_m is not None),
             poses=poses,
-            cameras={p.camera_key: reported_camera(p) for p in photos},
+            cameras={p.camera_key: p.lens for p in photos},
             camera_of={i: p.camera_key for i, p in enumerate(photos)},
             blocks=tuple((i,) for i in sorted(poses)),
             ties=no_ties(),

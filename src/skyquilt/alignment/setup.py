@@ -328,12 +328,10 @@ def intrinsic_priors(
     sigma: list[Array | list[float]] = []
     for photo in photos:
         wide = max(photo.width, photo.height)
+        known = photo.lens.vector
         if photo.calibration is not None:
-            known = photo.calibration.vector
             deviation = _calibrated_sigma(photo.calibration, photo.focal.sigma_px)
         else:
-            ideal = Camera.ideal(width=photo.width, height=photo.height, focal=photo.focal.px)
-            known = ideal.vector
             lengths = [photo.focal.sigma_px, 0.01 * wide, 0.01 * wide]
             deviation = np.array([*lengths, 0.1, 0.1, 0.05, 2e-3, 2e-3, SIGMA_ASPECT, 1.0])
         K0.append(np.r_[known, photo.shutter.readout_s])

@@ -54,7 +54,7 @@ def plane_link(link: Link, photos: Sequence[Photo], features: Sequence[Features]
     """The link in image coordinates over the focal length, y up."""
 
     def mean(photo: Photo, px: NDArray[Any]) -> complex:
-        x, y = as_pinhole(photo, px).mean(0)
+        x, y = as_pinhole(photo.lens, px).mean(0)
         return complex(x - (photo.width - 1) / 2, -(y - (photo.height - 1) / 2)) / photo.focal.px
 
     a, b = photos[link.a], photos[link.b]

@@ -201,9 +201,7 @@ class Members:
         photo = member.photo
         if known is not None:
             return known
-        return photo.calibration or Camera.ideal(
-            width=photo.width, height=photo.height, focal=photo.focal.px
-        )
+        return photo.lens
 
     def on_map(self) -> Iterator[Member]:
         """Photos that are drawn, in order."""

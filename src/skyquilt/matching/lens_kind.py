@@ -5,8 +5,8 @@ Metadata rarely tell which one a camera has. Photos of the same ground do: seen 
 they differ by nearly a homography, and read with the wrong kind of lens they do not.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,6 @@ from skyquilt.geometry.transforms import fit, transfer
 from skyquilt.matching.sphere_epipolar import agreeing
 from skyquilt.model.camera import Camera
 from skyquilt.model.features import Features, Link
-from skyquilt.model.photo import Photo
 
 Px = NDArray[np.float64]
 
@@ -48,7 +47,7 @@ FOCALS = (1.0, 0.8, 0.65)
 """Multiples of the reported focal length that are tried: a guess may be far off, and 35 mm
 equivalents of fisheyes are given by the field of view as well as by the focal length.
 """
-SIGMA_FOCAL = 0.15
+SIGMA_FOCAL = 0.2
 """Relative deviation of the focal length after that."""
 COUNTED_PX = 1.0
 """Tolerance of the matches that are counted, in px of the picture that was searched."""
@@ -62,74 +61,38 @@ and a stereographic projection (0.08) lie all lenses in use.
 """
 
 
-def as_pinhole(photo: Photo, px: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Where a pinhole with the same focal length and principal point shows what a photo's fisheye
-    shows at px (n, 2); unchanged where the photo has no fisheye.
+def as_pinhole(lens: Camera, px: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Where a pinhole with the same focal length and principal point shows what a fisheye shows at
+    px (n, 2); unchanged where the lens is no fisheye.
     """
-    camera = photo.calibration
-    return px if camera is None or not camera.fisheye else straight(camera, px)
+    return straight(lens, px) if lens.fisheye else px
 
 
-def lens_of(photo: Photo) -> Camera:
-    """The lens as far as metadata tell it."""
-    if photo.calibration is not None:
-        return photo.calibration
-    return Camera.ideal(width=photo.width, height=photo.height, focal=photo.focal.px)
-
-
-def lenses_of(a: Photo, b: Photo) -> tuple[Camera, Camera] | None:
-    """The lenses of two photos where one is a fisheye; None for pinholes."""
-    two = lens_of(a), lens_of(b)
-    return two if any(lens.fisheye for lens in two) else None
-
-
-def straight(camera: Camera, px: NDArray[np.floating]) -> Px:
+def straight(lens: Camera, px: NDArray[np.floating]) -> Px:
     """Pixels (n, 2) where a pinhole with the same focal length and principal point shows them."""
-    lengths = camera.focal * np.array([1.0, camera.aspect])
-    return np.asarray(
-        undistort(camera, np.asarray(px, np.float64)) * lengths + (camera.cx, camera.cy)
-    )
+    lengths = lens.focal * np.array([1.0, lens.aspect])
+    return np.asarray(undistort(lens, np.asarray(px, np.float64)) * lengths + (lens.cx, lens.cy))
 
 
-def as_fisheye(photo: Photo, multiple: float = 1.0) -> Photo:
-    """The photo as one of a fisheye whose focal length is the reported one times a factor."""
-    focal = photo.focal.px * multiple
-    wide = max(photo.width, photo.height)
-    ideal = Camera.ideal(width=photo.width, height=photo.height, focal=focal)
-    sigma = max(SIGMA_FOCAL * focal, photo.focal.sigma_px)
-    lengths = (sigma, 0.01 * wide, 0.01 * wide)
-    sigmas = (*lengths, *SIGMA_RADIAL, 2e-3, 2e-3, 3e-3, 0.0)
-    return replace(
-        photo,
-        calibration=replace(ideal, fisheye=1.0, sigmas=sigmas),
-        focal=replace(photo.focal, px=focal, sigma_px=sigma),
-    )
+def unit_rays(lens: Camera, px: Px) -> Px:
+    """Directions (N, 3) of unit length in camera coordinates of pixels (N, 2)."""
+    found = rays(lens, px)
+    return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
 
 
-def may_be_fisheye(photo: Photo) -> bool:
-    """Whether nothing tells the kind of a photo's lens, and it is wide enough for the question."""
-    corner = np.hypot(photo.width, photo.height) / 2
-    known = photo.calibration
-    bent = known is not None and bool(known.vector[3:8].any() or known.fisheye)
-    return not bent and photo.band == "visible" and corner > WIDE_RAD * photo.focal.px
+def as_fisheye(lens: Camera, multiple: float = 1.0) -> Camera:
+    """A fisheye whose focal length is that of a lens times a factor, as far as no more is known."""
+    focal, wide = lens.focal * multiple, max(lens.width, lens.height)
+    ideal = Camera.ideal(width=lens.width, height=lens.height, focal=focal)
+    lengths = (SIGMA_FOCAL * focal, 0.01 * wide, 0.01 * wide)
+    return replace(ideal, fisheye=1.0, sigmas=(*lengths, *SIGMA_RADIAL, 2e-3, 2e-3, 3e-3, 0.0))
 
 
-@dataclass(frozen=True, kw_only=True)
-class FoundFisheye:
-    """A camera that proved to have a fisheye."""
-
-    camera: str
-    """Its key."""
-    multiple: float
-    """Its focal length over the reported one, roughly."""
-
-    @property
-    def note(self) -> str:
-        """What a user should know."""
-        return (
-            f"The lens of {self.camera} is a fisheye's, as its photos show where they overlap; it"
-            " is adjusted as one."
-        )
+def may_be_fisheye(lens: Camera) -> bool:
+    """Whether nothing tells the kind of a lens, and it is wide enough for the question."""
+    corner = np.hypot(lens.width, lens.height) / 2
+    told = bool(lens.vector[3:8].any() or lens.fisheye)
+    return not told and corner > WIDE_RAD * lens.focal
 
 
 Matched = Callable[[int, int], tuple[Px, Px]]
@@ -137,33 +100,36 @@ Matched = Callable[[int, int], tuple[Px, Px]]
 
 
 def fisheyes(
-    photos: Sequence[Photo],
+    cameras: Sequence[str],
+    asked: Mapping[str, Camera],
     features: Sequence[Features],
     links: Sequence[Link],
     tried: Sequence[tuple[int, int]],
     matched: Matched,
-) -> Iterator[FoundFisheye]:
-    """Cameras with a fisheye among those whose lens nothing tells. `links`: as found with pinholes;
-    `tried`: all pairs that were compared, by which a camera is judged that has hardly a link.
+) -> dict[str, Camera]:
+    """The lenses of cameras that prove to have a fisheye, among those `asked`, with their reported
+    lenses. `cameras`: of each photo; `links`: as found with pinholes; `tried`: all pairs that were
+    compared, by which a camera is judged that has hardly a link.
     """
-    for key in dict.fromkeys(p.camera_key for p in photos if may_be_fisheye(p)):
-        own = {i for i, p in enumerate(photos) if p.camera_key == key}
+    found = {}
+    for key, lens in asked.items():
+        own = {i for i, camera in enumerate(cameras) if camera == key}
         linked = [k for k in links if k.a in own and k.b in own]
-        if len(linked) < FEWEST:
+        some = [linked[n] for n in _spread(len(linked))]
+        pairs = [(k.a, k.b) for k in some]
+        if len(some) < FEWEST:
             inside = [pair for pair in tried if pair[0] in own and pair[1] in own]
             pairs = [inside[n] for n in _spread(len(inside))]
         else:
-            some = [linked[n] for n in _spread(len(linked))]
-            straighter, multiple = _straighter(photos[min(own)], features, some)
+            straighter, multiple = _straighter(lens, features, some)
             if straighter < EVIDENT:
-                yield FoundFisheye(camera=key, multiple=multiple)
+                found[key] = as_fisheye(lens, multiple)
             if not EVIDENT <= straighter < SUSPECT:
                 continue
-            pairs = [(k.a, k.b) for k in some]
-        scale = features[min(own)].scale
-        found = _judged(photos[min(own)], [matched(*pair) for pair in pairs], scale)
-        if found is not None:
-            yield found
+        fisheye = _judged(lens, [matched(*pair) for pair in pairs], features[min(own)].scale)
+        if fisheye is not None:
+            found[key] = fisheye
+    return found
 
 
 def _spread(count: int) -> list[int]:
@@ -172,12 +138,12 @@ def _spread(count: int) -> list[int]:
 
 
 def _straighter(
-    photo: Photo, features: Sequence[Features], links: Iterable[Link]
+    lens: Camera, features: Sequence[Features], links: Iterable[Link]
 ) -> tuple[float, float]:
     """Residuals of matches from a homography when read as a fisheye's, over those as a pinhole's,
     in the median of links; and the multiple of the focal length for which they are least.
     """
-    bent = [c for c in (as_fisheye(photo, m).calibration for m in FOCALS) if c is not None]
+    bent = [as_fisheye(lens, m) for m in FOCALS]
     ratios = []
     for link in links:
         a, b = features[link.a].px[link.index_a], features[link.b].px[link.index_b]
@@ -206,26 +172,20 @@ def _stretch(camera: Camera, px: Px) -> float:
     return float(np.median(np.sqrt(np.tan(angle) / angle) / np.cos(angle)))
 
 
-def _judged(photo: Photo, pairs: Sequence[tuple[Px, Px]], scale: float) -> FoundFisheye | None:
+def _judged(lens: Camera, pairs: Sequence[tuple[Px, Px]], scale: float) -> Camera | None:
     """The fisheye with which most matches of pairs agree, if clearly more than with a pinhole of
     any of the same focal lengths.
     """
 
-    def count(camera: Camera) -> int:
-        tolerance = COUNTED_PX * scale / camera.focal
-        return sum(int(agreeing(unit_rays(camera, a), unit_rays(camera, b), tolerance).sum())
-                   for a, b in pairs)  # fmt: skip
+    def count(kind: Camera) -> int:
+        rad = COUNTED_PX * scale / kind.focal
+        agree = (agreeing(unit_rays(kind, a), unit_rays(kind, b), rad) for a, b in pairs)
+        return sum(int(mask.sum()) for mask in agree)
 
-    bent = {m: as_fisheye(photo, m).calibration for m in FOCALS}
-    counts = {m: (count(c), count(replace(c, fisheye=0.0))) for m, c in bent.items() if c}
-    best = max(counts, key=lambda m: counts[m][0])
-    fisheye, pinhole = counts[best][0], max(n for _, n in counts.values())
-    if fisheye < max(MORE * pinhole, pinhole + CERTAIN):
+    bent = [as_fisheye(lens, m) for m in FOCALS]
+    counts = [count(c) for c in bent]
+    pinhole = max(count(replace(c, fisheye=0.0)) for c in bent)
+    best = int(np.argmax(counts))
+    if counts[best] < max(MORE * pinhole, pinhole + CERTAIN):
         return None
-    return FoundFisheye(camera=photo.camera_key, multiple=best)
-
-
-def unit_rays(camera: Camera, px: Px) -> Px:
-    """Directions (N, 3) of unit length in camera coordinates of pixels (N, 2)."""
-    found = rays(camera, px)
-    return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
+    return bent[best]

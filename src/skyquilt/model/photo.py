@@ -176,6 +176,15 @@ class Photo:
     notes: tuple[str, ...] = ()
     """Plain sentences: what is missing, invalid or contradictory."""
 
+    @property
+    def lens(self) -> Camera:
+        """The calibration that metadata or a side file give, otherwise an ideal camera with the
+        reported focal length.
+        """
+        if self.calibration is not None:
+            return self.calibration
+        return Camera.ideal(width=self.width, height=self.height, focal=self.focal.px)
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RejectedPhoto:

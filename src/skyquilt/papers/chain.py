@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.inputs import GreyPicture
-from skyquilt.alignment.pose import reported_camera
 from skyquilt.geometry.camera import undistort
 from skyquilt.imaging.plane import to_grid
 from skyquilt.model.camera import Camera
@@ -66,7 +65,7 @@ class Chain:
         """Registers photos (indices) in the order given; where two do not match, a new piece
         begins.
         """
-        cameras = {p.camera_key: of_order(reported_camera(p), self.distortion) for p in photos}
+        cameras = {p.camera_key: of_order(p.lens, self.distortion) for p in photos}
         lens = [cameras[p.camera_key] for p in photos]
         return chained(
             lambda photo, onto: self._join(photo, onto, lens, features),
@@ -121,7 +120,7 @@ class DirectChain:
         """Registers photos (indices) in the order given; where two do not match, a new piece
         begins.
         """
-        cameras = {p.camera_key: of_order(reported_camera(p), self.distortion) for p in photos}
+        cameras = {p.camera_key: of_order(p.lens, self.distortion) for p in photos}
         lens = [cameras[p.camera_key] for p in photos]
 
         def join(photo: int, onto: int) -> tuple[Array, Join] | NoEstimate:

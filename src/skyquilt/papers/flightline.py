@@ -10,7 +10,6 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.pose import reported_camera
 from skyquilt.errors import AlignmentError
 from skyquilt.geometry.transforms import fit, transfer
 from skyquilt.model.camera import Camera
@@ -75,7 +74,7 @@ class ByFlightline:
         }
         order = [i for i in order if i not in lost]
         lines, notes = self._lines(order, xy, photos)
-        cameras = {p.camera_key: of_order(reported_camera(p), self.distortion) for p in photos}
+        cameras = {p.camera_key: of_order(p.lens, self.distortion) for p in photos}
         lens = [cameras[p.camera_key] for p in photos]
         work = _Work(method=self, photos=photos, lens=lens, features=features, notes=notes)
         strips = [s for line in lines for s in work.strips(line)]

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.pose import reported_camera
 from skyquilt.geometry.camera import undistort
 from skyquilt.imaging.plane import Overview, to_grid
 from skyquilt.model.camera import Camera
@@ -85,7 +84,7 @@ class ByOverview:
         """Registers photos (indices) in the order given; one that matches nothing begins a new
         piece.
         """
-        cameras = {p.camera_key: of_order(reported_camera(p), self.distortion) for p in photos}
+        cameras = {p.camera_key: of_order(p.lens, self.distortion) for p in photos}
         pieces: list[dict[int, Array]] = []
         joins, notes = [], []
         overview, K = Overview(), np.eye(3)

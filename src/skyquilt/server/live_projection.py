@@ -56,8 +56,7 @@ class LiveProjection:
             found = self.ledger.row("select body from camera where key = ?", key)
             if found and (camera := camera_from(found[0])):
                 return camera
-        ideal = Camera.ideal(width=photo.width, height=photo.height, focal=photo.focal.px)
-        return photo.calibration or ideal
+        return photo.lens
 
     def _on_ground(self, x: float, y: float) -> Xyz:
         """A place (map frame, m) with the height of the ground."""

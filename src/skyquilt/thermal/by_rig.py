@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from skyquilt.alignment.pose import reported_camera
 from skyquilt.coregistration.pictures import guess_of, open_picture
 from skyquilt.coregistration.rig import FindRig, Rig, RigPair
 from skyquilt.coregistration.workflow import outcome_of
@@ -73,7 +72,7 @@ def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistrati
         )
     asked = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, MOST_PAIRS).astype(int))]
     told = [p for i, j in asked if (p := _registered(scene, i, thermal[j])) is not None]
-    rig = FindRig(free=_freedom(first))(told, reported_camera(first))
+    rig = FindRig(free=_freedom(first))(told, first.lens)
     if isinstance(rig, RefusedRegistration):
         return rig
     poses = {k: _turned(placed.poses[i], rig) for k, (i, _) in enumerate(pairs)}

@@ -18,8 +18,9 @@ from skyquilt.imaging.nodes import View, project_nodes
 from skyquilt.imaging.views import make_views, on_ground
 from skyquilt.matching.candidates import Pair, sequence
 from skyquilt.matching.fixed_marks import FindFixedMarks, FixedMarks
-from skyquilt.matching.lens_kind import as_fisheye, fisheyes, lenses_of
+from skyquilt.matching.lens_kind import SIGMA_FOCAL, fisheyes, may_be_fisheye
 from skyquilt.matching.matchers import Guided
+from skyquilt.model.camera import Camera
 from skyquilt.model.features import Features, Link, Matches, RejectedLink, numbers
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import MapFrame, Prior
@@ -171,7 +172,9 @@ def link_pair(
     else:
         matches = methods.matcher(*features)
     matches = _on_ground(matches, marked)
-    return methods.verify(a, b, *features, matches, photos[0].width, lenses_of(*photos))
+    lenses = photos[0].lens, photos[1].lens
+    wide = lenses if lenses[0].fisheye or lenses[1].fisheye else None
+    return methods.verify(a, b, *features, matches, photos[0].width, wide)
 
 
 def _on_ground(
@@ -238,8 +241,7 @@ class _Linker:
 
 def seen_as(photo: Photo) -> object:
     """What of a photo enters its links: its content, and its lens if that is a fisheye."""
-    known = photo.calibration
-    return (photo.digest, known) if known is not None and known.fisheye else photo.digest
+    return (photo.digest, photo.lens) if photo.lens.fisheye else photo.digest
 
 
 def with_fisheyes(
@@ -259,14 +261,27 @@ def with_fisheyes(
         return two[0].px[matches.index_a], two[1].px[matches.index_b]
 
     tried = [(k.a, k.b) for k in links.links] + [(k.a, k.b) for k in links.rejected]
-    kinds = {f.camera: f for f in fisheyes(found.photos, features, links.links, tried, matched)}
-    if not kinds:
+    asked = {p.camera_key: p.lens for p in found.photos if p.band == "visible"}
+    asked = {key: lens for key, lens in asked.items() if may_be_fisheye(lens)}
+    cameras = [p.camera_key for p in found.photos]
+    lenses = fisheyes(cameras, asked, features, links.links, tried, matched)
+    if not lenses:
         return found, ()
     photos = tuple(
-        as_fisheye(p, kinds[p.camera_key].multiple) if p.camera_key in kinds else p
+        p if (lens := lenses.get(p.camera_key)) is None else _with_lens(p, lens)
         for p in found.photos
     )
-    return replace(found, photos=photos), tuple(f.note for f in kinds.values())
+    return replace(found, photos=photos), tuple(
+        f"The lens of {camera} is a fisheye's, as its photos show where they overlap; it is"
+        " adjusted as one."
+        for camera in lenses
+    )
+
+
+def _with_lens(photo: Photo, lens: Camera) -> Photo:
+    sigma = SIGMA_FOCAL * lens.focal
+    focal = replace(photo.focal, px=lens.focal, sigma_px=sigma)
+    return replace(photo, calibration=lens, focal=focal)
 
 
 def link_photos(
