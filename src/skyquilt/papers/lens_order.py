@@ -28,7 +28,7 @@ def of_order(camera: Camera, order: str) -> Camera:
         np.linspace(0, camera.width - 1, steps), np.linspace(0, camera.height - 1, steps)
     )
     px = np.stack(grid, -1).reshape(-1, 2)
-    x, y = undistort(camera, px).T
+    x, y = undistort(replace(camera, fisheye=0.0), px).T  # the polynomial follows the kind
     r2, n, zero = x * x + y * y, kept.radial, np.zeros_like(x)
     columns = [np.r_[x, y], np.r_[zero + 1, zero], np.r_[zero, zero + 1]]
     columns += [np.r_[x * r2**k, y * r2**k] for k in range(1, n + 1)]

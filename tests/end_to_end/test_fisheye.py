@@ -1,0 +1,74 @@
+"""Flights with a fisheye whose metadata do not tell its kind, from the folder to the map."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from skyquilt.simulate import FlightSettings
+from skyquilt.simulate.camera import Lens
+from skyquilt.simulate.settings import Control, Reporting, Route
+from tests.once import flown_once
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="session")
+def wide(tmp_path_factory):
+    """Twelve photos of 130 degrees; their files state a focal length 15 % off."""
+    settings = FlightSettings(
+        seed=611,
+        lens=Lens(fisheye=True).scaled(960, 720).seeing(130.0),
+        route=Route(photos=12, height=50.0, overlap=0.75, sidelap=0.65),
+        reporting=Reporting(focal_error=0.15),
+        control=Control(points=5, checks=6),
+    )
+    return flown_once(tmp_path_factory, "fisheye", settings)
+
+
+FULL = ("--features", "1500", "--gsd", "12", "--surface", "sweep")
+
+
+def placed_off_m(output, wide):
+    """(n,) m: distances of photos, as placed, from where they were, heights aside."""
+    truth = json.loads((wide / "truth" / "truth.json").read_text())
+    where = {p["name"]: p["position"] for p in truth["photos"]}
+    shots = json.loads((output / "shots.geojson").read_text())["features"]
+    return np.array(
+        [
+            math.dist(s["properties"]["translation"][:2], where[s["properties"]["filename"]][:2])
+            for s in shots
+        ]
+    )
+
+
+def test_a_fisheye_is_found_and_calibrated(mosaic, wide):
+    run = mosaic(wide / "photos", *FULL, "--gcp", wide / "gcp_list.txt").made()
+    m = run.metrics
+    assert m["blocks"] == [12]
+    assert any("fisheye" in w for w in m["warnings"])
+    assert m["reprojection_error_px"]["rms"] < 0.4
+    truth = json.loads((wide / "truth" / "truth.json").read_text())["cameras"]["visible"]
+    (camera,) = m["cameras"].values()
+    assert camera["projection"] == "fisheye"
+    for name in ("focal", "cx", "cy", "k1", "k2"):
+        found = camera[name]
+        assert abs(found["value"] - truth[name]) < 3 * found["sigma"], name
+    assert camera["focal"]["sigma"] < 0.01 * truth["focal"]
+    checks = np.array([(r["dx_m"], r["dy_m"], r["dz_m"]) for r in m["control"] if r["check"]])
+    gsd = 50 / truth["focal"]
+    rms = np.sqrt((checks**2).mean(0))
+    assert len(checks) >= 4 and max(rms[:2]) < gsd and rms[2] < 2 * gsd
+    (record,) = json.loads((run.output / "cameras.json").read_text()).values()
+    assert record["projection_type"] == "fisheye62"
+
+
+def test_its_own_cameras_json_tells_the_kind_beforehand(mosaic, wide, tmp_path):
+    first = mosaic(wide / "photos", *FULL, output=tmp_path / "first").made()
+    cameras = first.output / "cameras.json"
+    told = mosaic(wide / "photos", *FULL, "--cameras", cameras, output=tmp_path / "told").made()
+    assert not any("fisheye" in w for w in told.metrics["warnings"])
+    (camera,) = told.metrics["cameras"].values()
+    assert camera["projection"] == "fisheye" and told.metrics["blocks"] == [12]
+    assert np.median(placed_off_m(told.output, wide)) < 2.5  # positions of 2 m
