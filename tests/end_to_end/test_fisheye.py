@@ -2,6 +2,8 @@
 
 import json
 import math
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ import pytest
 from skyquilt.simulate import FlightSettings
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, Reporting, Route
+from tests.end_to_end.conftest import named
 from tests.once import flown_once
 
 pytestmark = pytest.mark.slow
@@ -72,3 +75,17 @@ def test_its_own_cameras_json_tells_the_kind_beforehand(mosaic, wide, tmp_path):
     (camera,) = told.metrics["cameras"].values()
     assert camera["projection"] == "fisheye" and told.metrics["blocks"] == [12]
     assert np.median(placed_off_m(told.output, wide)) < 2.5  # positions of 2 m
+
+
+def test_photos_are_added_to_its_map(mosaic, wide, tmp_path):
+    folder = Path(shutil.copytree(wide / "photos", tmp_path / "photos"))
+    late = named(folder)[9:]
+    aside = [path.rename(tmp_path / path.name) for path in late]
+    mosaic(folder, *FULL).made()
+    for path in aside:
+        path.rename(folder / path.name)
+    m = mosaic(folder, *FULL, "--add").made().metrics
+    assert m["blocks"] == [12] and m["added"]["photos"] == 3
+    (camera,) = m["cameras"].values()
+    assert camera["projection"] == "fisheye"
+    assert [c["field"] for c in m["metadata_conflicts"]] == ["focal"]  # stated 15 % off

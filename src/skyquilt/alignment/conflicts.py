@@ -164,8 +164,6 @@ def _lenses(
         photo, camera, told = photos[i], alignment.camera(i), photos[i].calibration
         if told is None or photo.camera_key in seen or camera.sigmas is None:
             continue
-        if photo.focal.source != "calibrated":  # only the kind of lens is known
-            continue
         seen.add(photo.camera_key)
         if alignment.camera_of[i] != photo.camera_key:  # a file saved upside down
             told = told.mirrored()

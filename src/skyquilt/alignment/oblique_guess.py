@@ -182,7 +182,7 @@ def _local(photo: Photo, px: NDArray[np.floating]) -> Array:
     """(n, 3) unit vectors in camera coordinates, the lens's distortion neglected."""
     middle = np.array([photo.width - 1, photo.height - 1]) / 2
     local = np.column_stack(
-        [(as_pinhole(photo.lens, px) - middle) / photo.focal.px, np.ones(len(px))]
+        [(as_pinhole(photo.lens, px) - middle) / photo.lens.focal, np.ones(len(px))]
     )
     return np.asarray(local / np.linalg.norm(local, axis=1, keepdims=True))
 

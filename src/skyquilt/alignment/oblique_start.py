@@ -167,7 +167,7 @@ def _rays(photo: Photo, prior: Prior, px: NDArray[np.floating]) -> Array:
     """(n, 3) unit vectors in the map frame, the lens's distortion neglected."""
     middle = np.array([photo.width - 1, photo.height - 1]) / 2
     local = np.column_stack(
-        [(as_pinhole(photo.lens, px) - middle) / photo.focal.px, np.ones(len(px))]
+        [(as_pinhole(photo.lens, px) - middle) / photo.lens.focal, np.ones(len(px))]
     )
     local /= np.linalg.norm(local, axis=1, keepdims=True)
     return local @ cam_R_map_from_angles(prior.yaw_deg, prior.pitch_deg, prior.roll_deg)

@@ -328,9 +328,10 @@ def intrinsic_priors(
     sigma: list[Array | list[float]] = []
     for photo in photos:
         wide = max(photo.width, photo.height)
-        known = photo.lens.vector
-        if photo.calibration is not None:
-            deviation = _calibrated_sigma(photo.calibration, photo.focal.sigma_px)
+        lens = photo.lens
+        known = lens.vector
+        if lens is photo.calibration or lens is photo.shown_lens:
+            deviation = _calibrated_sigma(lens, photo.focal.sigma_px)
         else:
             lengths = [photo.focal.sigma_px, 0.01 * wide, 0.01 * wide]
             deviation = np.array([*lengths, 0.1, 0.1, 0.05, 2e-3, 2e-3, SIGMA_ASPECT, 1.0])

@@ -55,13 +55,13 @@ def plane_link(link: Link, photos: Sequence[Photo], features: Sequence[Features]
 
     def mean(photo: Photo, px: NDArray[Any]) -> complex:
         x, y = as_pinhole(photo.lens, px).mean(0)
-        return complex(x - (photo.width - 1) / 2, -(y - (photo.height - 1) / 2)) / photo.focal.px
+        return complex(x - (photo.width - 1) / 2, -(y - (photo.height - 1) / 2)) / photo.lens.focal
 
     a, b = photos[link.a], photos[link.b]
     return PlaneLink(
         a=link.a,
         b=link.b,
-        b_S_a=link.b_S_a * a.focal.px / b.focal.px,
+        b_S_a=link.b_S_a * a.lens.focal / b.lens.focal,
         p_a=mean(a, features[link.a].px[link.index_a]),
         p_b=mean(b, features[link.b].px[link.index_b]),
         weight=min(float(len(link)), 300.0),

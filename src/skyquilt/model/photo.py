@@ -135,6 +135,10 @@ class Photo:
     """Photos with equal keys share their intrinsics: make, model, serial, lens, size, zoom."""
     calibration: Camera | None = None
     """Intrinsics that metadata or a side file give, distortion included."""
+    shown_lens: Camera | None = None
+    """A lens of another kind than metadata tell, where the photos of its camera show it
+    (`matching.lens_kind`).
+    """
     band_name: str = ""
     """Band that a file of a multispectral camera shows, in lower case; empty for others."""
     unusable_calibration: str = ""
@@ -178,12 +182,11 @@ class Photo:
 
     @property
     def lens(self) -> Camera:
-        """The calibration that metadata or a side file give, otherwise an ideal camera with the
-        reported focal length.
+        """The lens that the photos show, or the calibration that metadata or a side file give, or
+        an ideal camera with the reported focal length.
         """
-        if self.calibration is not None:
-            return self.calibration
-        return Camera.ideal(width=self.width, height=self.height, focal=self.focal.px)
+        known = self.shown_lens or self.calibration
+        return known or Camera.ideal(width=self.width, height=self.height, focal=self.focal.px)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -26,7 +26,8 @@ def photo_key(photo: Photo) -> str:
 def alignment_key(known: AlignmentInputs, methods: Methods, earlier: str = "") -> str:
     """Key of an alignment; `earlier`: of the map that it continues."""
     photos = [
-        (p.digest, p.name, p.camera_key, p.focal, p.calibration, p.editor) for p in known.photos
+        (p.digest, p.name, p.camera_key, p.focal, p.calibration, p.shown_lens, p.editor)
+        for p in known.photos
     ]
     moving = [(p.shutter, p.velocity_ned, p.time and p.time.isoformat()) for p in known.photos]
     held = [(k.a, k.b, k.index_a, k.index_b) for k in known.links]

@@ -18,9 +18,8 @@ from skyquilt.imaging.nodes import View, project_nodes
 from skyquilt.imaging.views import make_views, on_ground
 from skyquilt.matching.candidates import Pair, sequence
 from skyquilt.matching.fixed_marks import FindFixedMarks, FixedMarks
-from skyquilt.matching.lens_kind import SIGMA_FOCAL, fisheyes, may_be_fisheye
+from skyquilt.matching.lens_kind import fisheyes, may_be_fisheye
 from skyquilt.matching.matchers import Guided
-from skyquilt.model.camera import Camera
 from skyquilt.model.features import Features, Link, Matches, RejectedLink, numbers
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import MapFrame, Prior
@@ -268,7 +267,7 @@ def with_fisheyes(
     if not lenses:
         return found, ()
     photos = tuple(
-        p if (lens := lenses.get(p.camera_key)) is None else _with_lens(p, lens)
+        replace(p, shown_lens=lenses[p.camera_key]) if p.camera_key in lenses else p
         for p in found.photos
     )
     return replace(found, photos=photos), tuple(
@@ -276,12 +275,6 @@ def with_fisheyes(
         " adjusted as one."
         for camera in lenses
     )
-
-
-def _with_lens(photo: Photo, lens: Camera) -> Photo:
-    sigma = SIGMA_FOCAL * lens.focal
-    focal = replace(photo.focal, px=lens.focal, sigma_px=sigma)
-    return replace(photo, calibration=lens, focal=focal)
 
 
 def link_photos(
