@@ -60,8 +60,9 @@ def judge(reported, features, matches):
         return features[i].px[matches[i, j].index_a], features[j].px[matches[i, j].index_b]
 
     asked = {"one": lens(reported, fisheye=False)}
-    cameras = ["one"] * len(features)
-    return fisheyes(cameras, asked, features, links, list(matches), matched), len(links)
+    cameras = dict.fromkeys(range(len(features)), "one")
+    found = fisheyes(cameras, asked, features.__getitem__, links, list(matches), matched)
+    return found, len(links)
 
 
 @pytest.mark.parametrize("relief", [0.5, 6.0])

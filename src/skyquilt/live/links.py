@@ -14,6 +14,7 @@ from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.store import Store
 from skyquilt.live.failures import concerning
 from skyquilt.live.ledger import DAMAGED
+from skyquilt.live.lenses import LiveLenses
 from skyquilt.live.marks import LiveMarks
 from skyquilt.live.members import Member, Members
 from skyquilt.model.features import Features, Link, numbers
@@ -38,6 +39,7 @@ class LiveLinks:
         self.members, self.methods, self.store, self.pixels = members, methods, store, pixels
         self._features: OrderedDict[int, Features] = OrderedDict()
         self.marks = LiveMarks(members, self.features)
+        self.lenses = LiveLenses(members, self.features)
 
     def has_features(self, number: int) -> bool:
         """Whether a photo's features are in memory."""
@@ -60,8 +62,11 @@ class LiveLinks:
         """Links to other photos, compared one after the other until there are enough links; None
         where a pair does not match.
         """
-        if self.marks.look(member.photo.camera_key):
-            self._compare_again(member.photo.camera_key)
+        camera = member.photo.camera_key
+        marked = self.marks.look(camera)
+        bent = self.lenses.asks(camera) and self.lenses.bent(camera, self._of(camera))
+        if marked or bent:
+            self._compare_again(camera, marked=marked, bent=bent)
         found: dict[tuple[int, int], Link | None] = {}
         for i in others:
             if sum(link is not None for link in found.values()) >= ENOUGH:
@@ -77,18 +82,24 @@ class LiveLinks:
         link = link_pair(a, b, two, photos, self.methods, marked=marked)
         return link if isinstance(link, Link) else None
 
-    def _compare_again(self, camera: str) -> None:
-        """Links of a camera's photos anew, after marks were found on its pictures: they may rest on
-        nothing else.
-        """
+    def _of(self, camera: str) -> list[Link]:
+        """Links of a camera's photos."""
         ids = {i for i, m in self.members.by_id.items() if m.photo.camera_key == camera}
-        pairs = [(k.a, k.b) for k in self.links_among(self.members.by_id, ids)]
-        links = [(a, b, self._compared(a, b)) for a, b in pairs]
+        return self.links_among(self.members.by_id, ids)
+
+    def _compare_again(self, camera: str, *, marked: bool, bent: bool) -> None:
+        """Links of a camera's photos anew, after marks were found on its pictures, on which they
+        may rest alone, or another kind of lens.
+        """
+        links = [(k.a, k.b, self._compared(k.a, k.b)) for k in self._of(camera)]
         with self.members.ledger.change():
             self.members.ledger.put_links(
                 [(a, b, None if k is None else link_bytes(k)) for a, b, k in links]
             )
-            self.marks.keep(camera)
+            if marked:
+                self.marks.keep(camera)
+            if bent:
+                self.members.save_fisheye(camera)
         for a, b, link in links:
             if link is None:
                 self.members.parted(a, b)

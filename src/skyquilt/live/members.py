@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 from pyproj import Transformer
 
+from skyquilt.alignment.local_adjustment import TURNED
 from skyquilt.alignment.priors import empty_prior, photo_prior
 from skyquilt.live.failures import concerning
 from skyquilt.live.inbox import Inbox
 from skyquilt.live.ledger import DAMAGED, Ledger
 from skyquilt.live.settings import LiveSettings
+from skyquilt.matching.lens_kind import as_fisheye, fisheye_note
 from skyquilt.model.camera import ADJUSTABLE, PARAMETERS, Camera
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.poses import MapFrame, Motion, Pose, Prior
@@ -22,6 +24,8 @@ from skyquilt.outside import real, whole
 from skyquilt.photos.read import read_photo
 from skyquilt.photos.shutter import stated_shutter
 
+FISHEYES = "fisheyes"
+"""Name in the ledger of the cameras that proved to have a fisheye."""
 MOST_M = 1e9
 """Largest coordinate in the map's frame."""
 ON_MAP = ("placed", "refined")
@@ -91,6 +95,7 @@ class Members:
         self.block_of: dict[int, int] = {}
         self.blocks: dict[int, set[int]] = {}
         self.cameras: dict[str, Camera] = {}
+        self.fisheyes = _multiples(ledger.meta(FISHEYES))
         self.frame: MapFrame | None = None
         self._last = 0
         self._to_map: Transformer | None = None
@@ -139,7 +144,7 @@ class Members:
                 why = "what is stored of it is damaged"
                 self.ledger.set_photo(number, state="refused", reason=why, pose=None, footprint="")
                 continue
-            photo = replace(photo, shutter=self._shutter or photo.shutter)
+            photo = self._seen(replace(photo, shutter=self._shutter or photo.shutter))
             member = Member(
                 id=int(number),
                 photo=photo,
@@ -157,6 +162,33 @@ class Members:
             self.blocks[member.id] = {member.id}
             new.append(member)
         return new
+
+    def _seen(self, photo: Photo) -> Photo:
+        """The photo with the lens that photos of its camera show."""
+        multiple = self.fisheyes.get(photo.camera_key)
+        if multiple is None:
+            return photo
+        told = replace(photo, shown_lens=None).lens
+        return replace(photo, shown_lens=as_fisheye(told, multiple))
+
+    def bend(self, camera: str, multiple: float) -> None:
+        """A camera (`camera_key`) proved to have a fisheye, of a focal length of so many times the
+        reported one: calibrations found without that are dropped. `save_fisheye` stores it.
+        """
+        self.fisheyes[camera] = multiple
+        for member in self.by_id.values():
+            if member.photo.camera_key == camera:
+                member.photo = self._seen(member.photo)
+        for key in (camera, camera + TURNED):
+            self.cameras.pop(key, None)
+
+    def save_fisheye(self, camera: str) -> None:
+        """Stores that a camera proved to have a fisheye (inside a transaction of the ledger)."""
+        with self.ledger.change() as db:
+            self.ledger.put_meta(FISHEYES, self.fisheyes)
+            for key in (camera, camera + TURNED):
+                db.execute("delete from camera where key = ?", (key,))
+            self.ledger.tell("note", {"text": fisheye_note(camera)})
 
     def joined(self, a: int, b: int) -> None:
         """Records a link. A block is named by its first photo, whatever the order in which its
@@ -234,6 +266,13 @@ class Members:
         x0, y0 = self.frame.origin
         lon, lat = self._to_wgs.transform(np.asarray(xy)[:, 0] + x0, np.asarray(xy)[:, 1] + y0)
         return [[round(float(a), 8), round(float(b), 8)] for a, b in zip(lon, lat, strict=True)]
+
+
+def _multiples(said: Any) -> dict[str, float]:
+    """Focal lengths of fisheyes over the reported ones, by camera; without damaged ones."""
+    found = said.items() if isinstance(said, dict) else ()
+    read = {str(camera): real(multiple, 0.1, 10) for camera, multiple in found}
+    return {camera: multiple for camera, multiple in read.items() if multiple is not None}
 
 
 def _about(said: dict[str, Any]) -> dict[str, Any]:

@@ -95,25 +95,34 @@ def may_be_fisheye(lens: Camera) -> bool:
     return not told and corner > WIDE_RAD * lens.focal
 
 
+def fisheye_note(camera: str) -> str:
+    """What a user should know of a camera that proved to have a fisheye."""
+    return (
+        f"The lens of {camera} is a fisheye's, as its photos show where they overlap; it is"
+        " adjusted as one."
+    )
+
+
 Matched = Callable[[int, int], tuple[Px, Px]]
 """Places (n, 2) in px of the matches of two photos (numbers), in each."""
 
 
 def fisheyes(
-    cameras: Sequence[str],
+    cameras: Mapping[int, str],
     asked: Mapping[str, Camera],
-    features: Sequence[Features],
+    features: Callable[[int], Features],
     links: Sequence[Link],
     tried: Sequence[tuple[int, int]],
     matched: Matched,
 ) -> dict[str, Camera]:
     """The lenses of cameras that prove to have a fisheye, among those `asked`, with their reported
-    lenses. `cameras`: of each photo; `links`: as found with pinholes; `tried`: all pairs that were
-    compared, by which a camera is judged that has hardly a link.
+    lenses. `cameras`: of each photo by its number, as `features` are; `links`: as found with
+    pinholes; `tried`: all pairs that were compared, by which a camera is judged that has hardly
+    a link.
     """
     found = {}
     for key, lens in asked.items():
-        own = {i for i, camera in enumerate(cameras) if camera == key}
+        own = {i for i, camera in cameras.items() if camera == key}
         linked = [k for k in links if k.a in own and k.b in own]
         some = [linked[n] for n in _spread(len(linked))]
         pairs = [(k.a, k.b) for k in some]
@@ -126,7 +135,7 @@ def fisheyes(
                 found[key] = as_fisheye(lens, multiple)
             if not EVIDENT <= straighter < SUSPECT:
                 continue
-        fisheye = _judged(lens, [matched(*pair) for pair in pairs], features[min(own)].scale)
+        fisheye = _judged(lens, [matched(*pair) for pair in pairs], features(min(own)).scale)
         if fisheye is not None:
             found[key] = fisheye
     return found
@@ -138,7 +147,7 @@ def _spread(count: int) -> list[int]:
 
 
 def _straighter(
-    lens: Camera, features: Sequence[Features], links: Iterable[Link]
+    lens: Camera, features: Callable[[int], Features], links: Iterable[Link]
 ) -> tuple[float, float]:
     """Residuals of matches from a homography when read as a fisheye's, over those as a pinhole's,
     in the median of links; and the multiple of the focal length for which they are least.
@@ -146,7 +155,7 @@ def _straighter(
     bent = [as_fisheye(lens, m) for m in FOCALS]
     ratios = []
     for link in links:
-        a, b = features[link.a].px[link.index_a], features[link.b].px[link.index_b]
+        a, b = features(link.a).px[link.index_a], features(link.b).px[link.index_b]
         plain = max(_residual(a, b), 1e-9)
         ratios.append(
             [_residual(straight(c, a), straight(c, b)) / _stretch(c, b) / plain for c in bent]

@@ -18,7 +18,7 @@ from skyquilt.imaging.nodes import View, project_nodes
 from skyquilt.imaging.views import make_views, on_ground
 from skyquilt.matching.candidates import Pair, sequence
 from skyquilt.matching.fixed_marks import FindFixedMarks, FixedMarks
-from skyquilt.matching.lens_kind import fisheyes, may_be_fisheye
+from skyquilt.matching.lens_kind import fisheye_note, fisheyes, may_be_fisheye
 from skyquilt.matching.matchers import Guided
 from skyquilt.model.features import Features, Link, Matches, RejectedLink, numbers
 from skyquilt.model.photo import Photo
@@ -262,19 +262,15 @@ def with_fisheyes(
     tried = [(k.a, k.b) for k in links.links] + [(k.a, k.b) for k in links.rejected]
     asked = {p.camera_key: p.lens for p in found.photos if p.band == "visible"}
     asked = {key: lens for key, lens in asked.items() if may_be_fisheye(lens)}
-    cameras = [p.camera_key for p in found.photos]
-    lenses = fisheyes(cameras, asked, features, links.links, tried, matched)
+    cameras = {i: p.camera_key for i, p in enumerate(found.photos)}
+    lenses = fisheyes(cameras, asked, features.__getitem__, links.links, tried, matched)
     if not lenses:
         return found, ()
     photos = tuple(
         replace(p, shown_lens=lenses[p.camera_key]) if p.camera_key in lenses else p
         for p in found.photos
     )
-    return replace(found, photos=photos), tuple(
-        f"The lens of {camera} is a fisheye's, as its photos show where they overlap; it is"
-        " adjusted as one."
-        for camera in lenses
-    )
+    return replace(found, photos=photos), tuple(fisheye_note(camera) for camera in lenses)
 
 
 def link_photos(
