@@ -20,9 +20,8 @@ from skyquilt.errors import NoPhotosError, OutputError, PhotoFailedError, Unread
 from skyquilt.imaging.grey import halved, shrink, to_grey8
 from skyquilt.model.features import Features
 from skyquilt.model.photo import Photo, RejectedPhoto
-from skyquilt.photos.headers import content_digest
 from skyquilt.photos.kept_frames import kept_frame
-from skyquilt.photos.pixels import decode_jpeg, read_color
+from skyquilt.photos.pixels import decode_jpeg, lost, read_color
 from skyquilt.photos.read import rejected
 from skyquilt.workflows.methods import Detector
 
@@ -143,7 +142,7 @@ class PixelsInUse:
         except Exception as error:  # whatever it is, it concerns this photo alone
             name = self._names[photo]
             reason = rejected(name, error).reason
-            raise PhotoFailedError(name, f"could be read before, but now {reason}") from error
+            raise PhotoFailedError(name, f"it could be read before, but now {reason}") from error
 
     def make_room(self) -> None:
         """Drops the photos kept in memory where not all fit."""
@@ -202,8 +201,8 @@ def pixels_of(photo: Photo, store: Store) -> NDArray[Any]:
     """
     if photo.frame_s is None:
         pixels = read_color(photo)
-        if content_digest(photo.path) != photo.digest:
-            raise UnreadablePhotoError("is another photo than the one that was read before")
+        if reason := lost(photo):
+            raise UnreadablePhotoError(reason)
         return pixels
     body = store.get_or(FRAMES, photo.digest, lambda: kept_frame(read_color(photo)))
     return decode_jpeg(body.tobytes())
@@ -284,6 +283,7 @@ def find_features(
 
     Raises:
         NoPhotosError: no photo could be decoded.
+        PhotoFailedError: the file of a photo is no longer the one that was read.
     """
     cv2.setNumThreads(1)  # photos are processed in parallel instead
 
@@ -299,6 +299,8 @@ def find_features(
         except OutputError:  # a full disk is no fault of the photo
             raise
         except Exception as error:  # whatever it is, it concerns this photo alone
+            if reason := lost(photos[index]):  # others may be lost with it
+                raise PhotoFailedError(photos[index].name, reason) from error
             return rejected(photos[index].name, error)
         return None
 
