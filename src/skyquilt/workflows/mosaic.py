@@ -241,10 +241,12 @@ class _Making:
 def _without_bad(
     given: SurveyInput, make: _Making
 ) -> Generator[Event, None, tuple[dict[str, Any], SurveyInput, str]]:
-    """Metrics of the map, the survey that it shows, and the key of its run: a photo on which a step fails, or whose
-    file is no longer the one that was read, is left out, and the steps are repeated without it;
-    results that do not depend on it are in the store. The key is that of a run without the photos
-    whose files are lost, so that with these files again the map does not count as finished.
+    """Metrics of the map, the survey that it shows, and the key of its run.
+
+    A photo on which a step fails, or whose file is no longer the one that was read, is left out,
+    and the steps are repeated without it; results that do not depend on it are in the store. The
+    key is that of a run without the photos whose files are lost: with these files again, the map
+    does not count as finished.
 
     Raises:
         SkyquiltError: more than half of the photos, so it is not the photos that are bad.
