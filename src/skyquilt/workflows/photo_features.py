@@ -20,6 +20,7 @@ from skyquilt.errors import NoPhotosError, OutputError, PhotoFailedError, Unread
 from skyquilt.imaging.grey import halved, shrink, to_grey8
 from skyquilt.model.features import Features
 from skyquilt.model.photo import Photo, RejectedPhoto
+from skyquilt.outside import out_of_memory
 from skyquilt.photos.kept_frames import kept_frame
 from skyquilt.photos.pixels import decode_jpeg, lost, read_color
 from skyquilt.photos.read import rejected
@@ -136,11 +137,14 @@ class PixelsInUse:
 
         Raises:
             PhotoFailedError: a photo that could be read before is lost.
+            MemoryError: there is not enough memory.
         """
         try:
             return self._cache(self._number[photo])
         except Exception as error:  # whatever it is, it concerns this photo alone
             name = self._names[photo]
+            if out_of_memory(error):
+                raise MemoryError(f"it does not suffice to decode {name}") from error
             reason = rejected(name, error).reason
             raise PhotoFailedError(name, f"it could be read before, but now {reason}") from error
 
@@ -284,6 +288,7 @@ def find_features(
     Raises:
         NoPhotosError: no photo could be decoded.
         PhotoFailedError: the file of a photo is no longer the one that was read.
+        MemoryError: there is not enough memory, which is no fault of a photo.
     """
     cv2.setNumThreads(1)  # photos are processed in parallel instead
 
@@ -299,6 +304,8 @@ def find_features(
         except OutputError:  # a full disk is no fault of the photo
             raise
         except Exception as error:  # whatever it is, it concerns this photo alone
+            if out_of_memory(error):
+                raise MemoryError(f"it does not suffice to read {photos[index].name}") from error
             if reason := lost(photos[index]):  # others may be lost with it
                 raise PhotoFailedError(photos[index].name, reason) from error
             return rejected(photos[index].name, error)
