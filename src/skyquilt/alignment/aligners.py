@@ -1,7 +1,8 @@
 """The aligners of every survey: `bundle`, `pose`, `position`, and `auto`, which chooses."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -23,6 +24,7 @@ from skyquilt.geometry.camera import project
 from skyquilt.geometry.frames import cam_R_map_from_angles
 from skyquilt.model.camera import Camera
 from skyquilt.model.features import Features
+from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, Pose, Prior
 
 SHOWN_ALREADY = 0.8
@@ -37,6 +39,8 @@ TONE_PX, BLACK, WHITE = 64, 12, 243
 """Longest side in px of a picture that is asked whether it is black or white all over, and the
 levels of 255 below and above which it is.
 """
+ONE_TONE = "it is black or white all over"
+"""The reason recorded for such a photo."""
 REQUESTED = "asked for"
 """The reason recorded for a method that the user requested."""
 
@@ -219,8 +223,8 @@ def with_loose_photos(alignment: Alignment, inputs: AlignmentInputs) -> Alignmen
             reason = "it could not be linked to the other photos, and it has"
             rejected[i] = rejected.get(i, f"{reason} {lacking} to place it by")
             continue
-        if one_tone(inputs, i):
-            rejected[i] = "it is black or white all over"
+        if one_tone(photo, inputs.features[i], partial(inputs.grey, i)):
+            rejected[i] = ONE_TONE
             notes.append(f"{photo.name} is left out: {rejected[i]}.")
             continue
         weak = rejected.pop(i, "it could not be linked to any other photo")
@@ -246,14 +250,13 @@ def with_loose_photos(alignment: Alignment, inputs: AlignmentInputs) -> Alignmen
     )
 
 
-def one_tone(inputs: AlignmentInputs, i: int) -> bool:
+def one_tone(photo: Photo, found: Features, grey: Callable[[int], NDArray[np.uint8]]) -> bool:
     """Whether a photo is black or white all over: a lens cap, a failed exposure. It would be drawn
-    as a hole in the map. Measured values are none.
+    as a hole in the map. Measured values are none. `grey`: the photo in grey, by its longest side.
     """
-    photo = inputs.photos[i]
-    if photo.dtype != "uint8" or photo.unit or len(inputs.features[i].px) >= KEYPOINTS:
+    if photo.dtype != "uint8" or photo.unit or len(found) >= KEYPOINTS:
         return False
-    dark, light = np.percentile(inputs.grey(i, TONE_PX), [1, 99])
+    dark, light = np.percentile(grey(TONE_PX), [1, 99])
     return bool(light < BLACK or dark > WHITE)
 
 

@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.aligners import ONE_TONE, one_tone
 from skyquilt.engine.codec import decode, encode
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.store import Store
+from skyquilt.errors import UnreadablePhotoError
 from skyquilt.live.failures import concerning
 from skyquilt.live.ledger import DAMAGED
 from skyquilt.live.marks import LiveMarks
@@ -19,7 +21,7 @@ from skyquilt.live.members import Member, Members
 from skyquilt.model.features import Features, Link, numbers
 from skyquilt.workflows.links import link_pair, marked_in
 from skyquilt.workflows.methods import Methods
-from skyquilt.workflows.photo_features import photo_features
+from skyquilt.workflows.photo_features import photo_features, picture_of
 
 FEATURES_KEPT = 48
 """Number of photos whose features are kept in memory."""
@@ -44,13 +46,19 @@ class LiveLinks:
         return number in self._features
 
     def features(self, number: int) -> Features:
-        """Features of a photo: from memory, from the store, or computed now."""
+        """Features of a photo: from memory, from the store, or computed now.
+
+        Raises:
+            MemberFailedError: it cannot be decoded, or is black or white all over.
+        """
         if number in self._features:
             self._features.move_to_end(number)
             return self._features[number]
         photo, pixels = self.members.by_id[number].photo, self.pixels
         with concerning(number):
             look = photo_features(photo, lambda: pixels(number), self.methods.detector, self.store)
+            if one_tone(photo, look.features, lambda px: picture_of(pixels(number), px)):
+                raise UnreadablePhotoError(ONE_TONE)
         self._features[number] = look.features
         while len(self._features) > FEATURES_KEPT:
             self._features.popitem(last=False)

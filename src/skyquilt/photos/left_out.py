@@ -77,7 +77,7 @@ def _is_reduced(photo: Photo, original: Photo) -> bool:
 
 def bands_of(photos: Sequence[Photo]) -> Counter[str]:
     """Photos of each band that files of one channel name."""
-    return Counter(p.band_name for p in photos if _of_a_band(p))
+    return Counter(p.band_name for p in photos if shows_a_band(p))
 
 
 def of_one_band(survey: Survey, wanted: str | None) -> Survey:
@@ -94,13 +94,11 @@ def of_one_band(survey: Survey, wanted: str | None) -> Survey:
     if len(bands) < 2 and wanted is None:
         return survey
     shown = wanted.lower() if wanted is not None else _usual(bands)
-    kept = [p for p in survey.photos if p.band_name == shown or not _of_a_band(p)]
+    kept = [p for p in survey.photos if p.band_name == shown or not shows_a_band(p)]
     out = [
-        RejectedPhoto(
-            name=p.name, reason=f"it shows the band {p.band_name}; the map shows {shown} (--band)"
-        )
+        RejectedPhoto(name=p.name, reason=another_band(p, shown))
         for p in survey.photos
-        if _of_a_band(p) and p.band_name != shown
+        if shows_a_band(p) and p.band_name != shown
     ]
     return replace(
         survey,
@@ -121,7 +119,13 @@ def band_note(photos: Sequence[Photo]) -> tuple[str, ...]:
     )
 
 
-def _of_a_band(photo: Photo) -> bool:
+def another_band(photo: Photo, shown: str) -> str:
+    """The reason why a photo is left out of a map of the band `shown`."""
+    return f"it shows the band {photo.band_name}; the map shows {shown} (--band)"
+
+
+def shows_a_band(photo: Photo) -> bool:
+    """Whether a file shows one band of a multispectral camera."""
     return bool(photo.band_name) and photo.channels == 1
 
 
