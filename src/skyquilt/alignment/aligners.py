@@ -34,7 +34,7 @@ would show.
 NEIGHBOURS = 40
 """So many of the nearest connected photos are asked."""
 KEYPOINTS = 8
-"""A photo with fewer shows next to nothing: a lens cap, a white sky."""
+"""A photo with fewer shows next to nothing: a lens cap without noise, a white sky."""
 TONE_PX, BLACK, WHITE = 64, 12, 243
 """Longest side in px of a picture that is asked whether it is black or white all over, and the
 levels of 255 below and above which it is.
@@ -53,7 +53,7 @@ class ByLinks:
 
     bundle: Bundle = field(default_factory=Bundle)
     """The adjustment."""
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
     needs_links: ClassVar[bool] = True
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -123,7 +123,7 @@ class Auto:
     """For linked photos."""
     pose: ByReport
     """For photos that only have positions."""
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
     needs_links: ClassVar[bool] = True
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -223,7 +223,7 @@ def with_loose_photos(alignment: Alignment, inputs: AlignmentInputs) -> Alignmen
             reason = "it could not be linked to the other photos, and it has"
             rejected[i] = rejected.get(i, f"{reason} {lacking} to place it by")
             continue
-        if one_tone(photo, inputs.features[i], partial(inputs.grey, i)):
+        if one_tone(photo, partial(inputs.grey, i)):
             rejected[i] = ONE_TONE
             notes.append(f"{photo.name} is left out: {rejected[i]}.")
             continue
@@ -250,11 +250,12 @@ def with_loose_photos(alignment: Alignment, inputs: AlignmentInputs) -> Alignmen
     )
 
 
-def one_tone(photo: Photo, found: Features, grey: Callable[[int], NDArray[np.uint8]]) -> bool:
-    """Whether a photo is black or white all over: a lens cap, a failed exposure. It would be drawn
-    as a hole in the map. Measured values are none. `grey`: the photo in grey, by its longest side.
+def one_tone(photo: Photo, grey: Callable[[int], NDArray[np.uint8]]) -> bool:
+    """Whether a photo without links is black or white all over: a lens cap, a failed exposure. It
+    would be drawn as a hole in the map. Measured values are none. `grey`: the photo in grey, by its
+    longest side; in a small one the noise of the sensor, in which features are found, is gone.
     """
-    if photo.dtype != "uint8" or photo.unit or len(found) >= KEYPOINTS:
+    if photo.dtype != "uint8" or photo.unit:
         return False
     dark, light = np.percentile(grey(TONE_PX), [1, 99])
     return bool(light < BLACK or dark > WHITE)

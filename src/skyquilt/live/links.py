@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.aligners import ONE_TONE, one_tone
+from skyquilt.alignment.aligners import KEYPOINTS, one_tone
 from skyquilt.engine.codec import decode, encode
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.store import Store
-from skyquilt.errors import UnreadablePhotoError
 from skyquilt.live.failures import concerning
 from skyquilt.live.ledger import DAMAGED
 from skyquilt.live.marks import LiveMarks
@@ -46,23 +45,26 @@ class LiveLinks:
         return number in self._features
 
     def features(self, number: int) -> Features:
-        """Features of a photo: from memory, from the store, or computed now.
-
-        Raises:
-            MemberFailedError: it cannot be decoded, or is black or white all over.
-        """
+        """Features of a photo: from memory, from the store, or computed now."""
         if number in self._features:
             self._features.move_to_end(number)
             return self._features[number]
         photo, pixels = self.members.by_id[number].photo, self.pixels
         with concerning(number):
             look = photo_features(photo, lambda: pixels(number), self.methods.detector, self.store)
-            if one_tone(photo, look.features, lambda px: picture_of(pixels(number), px)):
-                raise UnreadablePhotoError(ONE_TONE)
         self._features[number] = look.features
         while len(self._features) > FEATURES_KEPT:
             self._features.popitem(last=False)
         return look.features
+
+    def shows_nothing(self, number: int, *, compared: bool) -> bool:
+        """Whether a photo without links is black or white all over. One that could not be compared
+        yet may be a dark photo of a flight at night, unless it has hardly any features.
+        """
+        if not compared and len(self.features(number)) >= KEYPOINTS:
+            return False
+        photo = self.members.by_id[number].photo
+        return one_tone(photo, lambda longest: picture_of(self.pixels(number), longest))
 
     def compared(self, member: Member, others: Sequence[int]) -> dict[tuple[int, int], Link | None]:
         """Links to other photos, compared one after the other until there are enough links; None
