@@ -214,8 +214,8 @@ def test_sizes_of_one_pixel_are_refused_not_met_with_a_crash(mosaic, photos):
 @pytest.mark.slow
 @pytest.mark.parametrize(("number", "noise"), [(4, 0.0), (0, 1.5)])
 def test_a_black_photo(mosaic, photos, number, noise):
-    """It shows nothing: it is left out, not drawn where its metadata say, and is named. The noise of
-    a sensor has features that match nothing, and at the rim no other photo shows what it would.
+    """It shows nothing: it is left out, not drawn where its metadata say, and is named. Noise of a
+    sensor has features that match nothing, and at the rim no other photo shows what it would.
     """
     path = named(photos)[number]
     block, xmp, _ = taken_apart(path.read_bytes())
