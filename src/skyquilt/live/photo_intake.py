@@ -16,7 +16,6 @@ from skyquilt.live.ledger import Ledger, hit
 from skyquilt.live.settings import LiveSettings
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.outside import open_regular, plain
-from skyquilt.photos.left_out import another_band, shows_a_band
 from skyquilt.photos.read import read_photo, rejected
 from skyquilt.video.srt import MOST_TELEMETRY_BYTES
 
@@ -151,9 +150,9 @@ class Intake:
             known = self.ledger.row("select id, name from photo where digest = ?", arrived.digest)
             if known is not None:
                 return Accepted(id=int(known[0]), name=str(known[1]), duplicate=True)
-            if shows_a_band(photo) and photo.band_name != (band := self._band(photo)):
+            if photo.shows_a_band and (reason := photo.other_band(self._band(photo))):
                 gone(arrived.path)
-                return self.refuse(name, source, another_band(photo, band))
+                return self.refuse(name, source, reason)
             same = self.ledger.rows(
                 "select id, name, width from photo where shot = ? and width != ? and state !="
                 " 'superseded'"

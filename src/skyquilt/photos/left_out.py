@@ -77,7 +77,7 @@ def _is_reduced(photo: Photo, original: Photo) -> bool:
 
 def bands_of(photos: Sequence[Photo]) -> Counter[str]:
     """Photos of each band that files of one channel name."""
-    return Counter(p.band_name for p in photos if shows_a_band(p))
+    return Counter(p.band_name for p in photos if p.shows_a_band)
 
 
 def of_one_band(survey: Survey, wanted: str | None) -> Survey:
@@ -94,11 +94,11 @@ def of_one_band(survey: Survey, wanted: str | None) -> Survey:
     if len(bands) < 2 and wanted is None:
         return survey
     shown = wanted.lower() if wanted is not None else _usual(bands)
-    kept = [p for p in survey.photos if p.band_name == shown or not shows_a_band(p)]
+    kept = [p for p in survey.photos if not p.other_band(shown)]
     out = [
-        RejectedPhoto(name=p.name, reason=another_band(p, shown))
+        RejectedPhoto(name=p.name, reason=reason)
         for p in survey.photos
-        if shows_a_band(p) and p.band_name != shown
+        if (reason := p.other_band(shown))
     ]
     return replace(
         survey,
@@ -117,16 +117,6 @@ def band_note(photos: Sequence[Photo]) -> tuple[str, ...]:
         f"Each file shows one band of a multispectral camera: {listed}. A map shows one of them,"
         f" {_usual(bands)} unless --band names another.",
     )
-
-
-def another_band(photo: Photo, shown: str) -> str:
-    """The reason why a photo is left out of a map of the band `shown`."""
-    return f"it shows the band {photo.band_name}; the map shows {shown} (--band)"
-
-
-def shows_a_band(photo: Photo) -> bool:
-    """Whether a file shows one band of a multispectral camera."""
-    return bool(photo.band_name) and photo.channels == 1
 
 
 def _usual(bands: Counter[str]) -> str:
