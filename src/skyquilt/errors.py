@@ -53,7 +53,7 @@ class PhotoFailedError(SkyquiltError):
     """
 
     def __init__(self, photo: str, reason: str) -> None:
-        super().__init__(f"{photo} {reason}")
+        super().__init__(f"{photo}: {reason}")
         self.photo, self.reason = photo, reason
 
     def __reduce__(self) -> tuple[type["PhotoFailedError"], tuple[str, str]]:

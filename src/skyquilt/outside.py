@@ -42,6 +42,8 @@ MOST_TEXT_BYTES = 64_000_000
 """Largest side file in bytes."""
 MOST_DIGITS = 64
 """Largest number of characters of a number."""
+_CV_NO_MEMORY = -4
+"""OpenCV's code of an error (`Error::StsNoMem`)."""
 _REAL = re.compile(r"[+-]?(?:\d++(?:\.\d*+)?+|\.\d++)(?:[eE][+-]?\d{1,4})?+", re.ASCII)
 _WHOLE = re.compile(r"[+-]?\d{1,30}", re.ASCII)
 
@@ -244,6 +246,21 @@ def check_picture(
             f"its file of {file_bytes // 10**6} MB is far larger than its {width}x{height} px can"
             " need"
         )
+
+
+def out_of_memory(error: BaseException | None) -> bool:
+    """Whether an error, or what caused it, is that the system gave no more memory or threads: not
+    the fault of the file that was read just then.
+    """
+    while error is not None:
+        if isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
+            return True
+        if type(error).__module__ == "cv2" and getattr(error, "code", 0) == _CV_NO_MEMORY:
+            return True
+        if isinstance(error, RuntimeError) and "start new thread" in str(error):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 class Database(sqlite3.Connection):

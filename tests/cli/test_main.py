@@ -1,5 +1,6 @@
 """The command line's promises: choices, exit codes, sentences instead of tracebacks."""
 
+import errno
 import os
 import re
 import subprocess
@@ -274,3 +275,32 @@ def test_a_name_that_the_system_refuses_gets_a_sentence(monkeypatch, capsys, tmp
     said = capsys.readouterr().err
     assert code in (2, 3, 5), said
     assert "skyquilt: " in said and "Traceback" not in said
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError("Unable to allocate 9 GiB"),
+        OSError(errno.ENOMEM, "Cannot allocate memory"),
+        RuntimeError("can't start new thread"),
+    ],
+)
+def test_a_full_memory_is_a_sentence(monkeypatch, capsys, error):
+    def fails():
+        raise RuntimeError("the step that met it") from error
+
+    monkeypatch.setattr("skyquilt.cli.app.app", fails)
+    with pytest.raises(SystemExit) as end:
+        main.run()
+    assert end.value.code == 1
+    told = capsys.readouterr().err
+    assert told.startswith("skyquilt: the system gives no more memory") and told.count("\n") == 1
+
+
+def test_a_bug_keeps_its_traceback(monkeypatch):
+    def fails():
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr("skyquilt.cli.app.app", fails)
+    with pytest.raises(RuntimeError, match="a bug"):
+        main.run()

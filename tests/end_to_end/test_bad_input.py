@@ -212,11 +212,15 @@ def test_sizes_of_one_pixel_are_refused_not_met_with_a_crash(mosaic, photos):
 
 
 @pytest.mark.slow
-def test_a_black_photo(mosaic, photos):
-    """It shows nothing: it is left out, not drawn where its metadata say, and is named."""
-    path = named(photos)[4]
+@pytest.mark.parametrize(("number", "noise"), [(4, 0.0), (0, 1.5)])
+def test_a_black_photo(mosaic, photos, number, noise):
+    """It shows nothing: it is left out, not drawn where its metadata say, and is named. Noise of a
+    sensor has features that match nothing, and at the rim no other photo shows what it would.
+    """
+    path = named(photos)[number]
     block, xmp, _ = taken_apart(path.read_bytes())
-    data = jpeg_bytes(np.zeros((HIGH, WIDE, 3), np.uint8))
+    dark = np.random.default_rng(0).normal(2 * noise, noise, (HIGH, WIDE, 3))
+    data = jpeg_bytes(np.clip(dark, 0, 255).astype(np.uint8))
     data = with_segment(data, 0xE1, b"http://ns.adobe.com/xap/1.0/\x00" + xmp.encode())
     path.write_bytes(with_segment(data, 0xE1, block))
     told = mosaic(photos).made()

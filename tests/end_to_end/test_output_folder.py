@@ -19,7 +19,7 @@ import rasterio
 
 from skyquilt.engine import codec
 from skyquilt.engine.folder import CONTRACT
-from skyquilt.errors import OutputError
+from skyquilt.errors import OutputError, SkyquiltError
 from skyquilt.model.event import StageStarted
 from skyquilt.settings import MosaicSettings
 from skyquilt.workflows import flow
@@ -598,3 +598,34 @@ def test_a_photo_spoiled_while_a_map_is_made_is_left_out(
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert metrics["photos_used"] == 8
     assert list(metrics["photos_rejected"]) == [bad.name]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", ["features", "links", "mosaic"])
+def test_a_disk_that_is_pulled_out_while_a_map_is_made(
+    mosaic, photos, finished, tmp_path, monkeypatch, stage
+):
+    """The map is not made of what had been read by then: with the disk back the run goes on."""
+    monkeypatch.setattr(flow, "pixel_budget", lambda memory: 0)
+    away, settings = photos.with_name("away"), MosaicSettings(features=300, surface="ties")
+    with pytest.raises(SkyquiltError, match=r"\d of 9 photos cannot be used any more"):
+        for event in iter_mosaic(photos, tmp_path / "out", settings.changed(gsd_cm=30.0, jobs=1)):
+            if isinstance(event, StageStarted) and event.stage == stage:
+                photos.rename(away)
+    away.rename(photos)
+    same_result(mosaic(photos, output=tmp_path / "out").made().output, finished)
+
+
+@pytest.mark.slow
+def test_a_photo_that_comes_back_is_not_missed_for_ever(mosaic, photos, finished, tmp_path):
+    """A map without photos that were lost while it was made is not the finished map of all."""
+    away, settings = tmp_path / "away.jpg", MosaicSettings(features=300, surface="ties")
+    for event in iter_mosaic(photos, tmp_path / "out", settings.changed(gsd_cm=30.0, jobs=1)):
+        if isinstance(event, StageStarted) and event.stage == "features" and not away.exists():
+            named(photos)[4].rename(away)
+    told = mosaic(photos, output=tmp_path / "out").made()
+    assert told.metrics["photos_used"] == 8 and "nothing to do" in told.out + told.err
+    away.rename(photos / "SIM_0005.jpg")
+    assert mosaic(photos, output=tmp_path / "out").code == 5
+    again = mosaic(photos, "--overwrite", output=tmp_path / "out").made()
+    same_result(again.output, finished)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from skyquilt.engine import lock
-from skyquilt.engine.folder import CONTRACT, STATE, open_run
+from skyquilt.engine.folder import CONTRACT, STATE, claimed, open_run
 from skyquilt.engine.lock import NO_LOCKS
 from skyquilt.errors import OutputError
 
@@ -147,3 +147,42 @@ def test_refusals_of_the_disk_say_what_to_do(tmp_path, monkeypatch, number, word
     monkeypatch.setattr(Path, "write_text", refuse)
     with pytest.raises(OutputError, match=words):
         run.mark("done")
+
+
+def working(folder, say):
+    """A process that holds the folder until it is told to end."""
+    code = (
+        "import sys; from pathlib import Path; from skyquilt.engine.folder import claimed\n"
+        f"with claimed(Path({str(folder)!r}), ['a.json'], overwrite=True):\n"
+        f"    print({say!r}, flush=True); sys.stdin.read(1)\n"
+    )
+    return subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+
+
+def test_one_command_writes_to_a_folder_at_a_time(tmp_path):
+    out = tmp_path / "out"
+    with working(out, "here") as other:
+        assert other.stdout.readline() == "here\n"
+        (out / "a.json").write_text("the other's")
+        for overwrite in (False, True):
+            with pytest.raises(OutputError), claimed(out, ["a.json"], overwrite=overwrite):
+                pass
+        with pytest.raises(OutputError, match=f"process {other.pid}"):
+            open_run(out, "key", overwrite=True)
+        assert (out / "a.json").read_text() == "the other's"
+        other.communicate("x")
+    assert [p.name for p in out.iterdir()] == ["a.json"]  # no lock is left behind
+    with pytest.raises(OutputError, match="already holds files"), claimed(out, [], overwrite=False):
+        pass
+
+
+def test_a_killed_command_leaves_nothing_in_the_way(tmp_path):
+    out = tmp_path / "out"
+    with working(out, "here") as other:
+        other.stdout.readline()
+        other.kill()
+    with claimed(out, ["a.json"], overwrite=False):
+        (out / "a.json").write_text("new")
+    assert [p.name for p in out.iterdir()] == ["a.json"]

@@ -2,10 +2,13 @@
 rotation.
 """
 
+import shutil
+
 import cv2
 import numpy as np
 import pytest
 import rasterio
+import tifffile
 
 from skyquilt.errors import RefusedError
 from skyquilt.geometry.camera import project, rays
@@ -93,3 +96,18 @@ def test_frames_of_other_ground_are_refused(flight, frames, output, tmp_path):
         cv2.imwrite(str(tmp_path / "wrong" / path.name), noise)
     with pytest.raises(RefusedError, match="0 pairs taken together could be registered"):
         list(iter_thermal(flight / "photos", tmp_path / "wrong", output, SETTINGS, route="rig"))
+
+
+@pytest.mark.slow
+def test_a_damaged_frame_is_left_out(flight, frames, output, tmp_path):
+    """Its header is whole, so it is met only when its values are read."""
+    shutil.copytree(frames, tmp_path / "heat")
+    bad = sorted((tmp_path / "heat").glob("*.tif"))[2]
+    tifffile.imwrite(bad, tifffile.imread(bad), compression="zlib")
+    whole = bad.read_bytes()
+    bad.write_bytes(whole[:2000] + bytes(len(whole) // 2) + whole[2000 + len(whole) // 2 :])
+    *_, last = iter_thermal(flight / "photos", tmp_path / "heat", output, SETTINGS)
+    assert isinstance(last, Result)
+    told = last.metrics["thermal"]
+    assert told["route"] == "rig" and told["photos_used"] == 8
+    assert list(told["photos_rejected"]) == [bad.name]

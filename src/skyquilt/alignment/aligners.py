@@ -1,7 +1,8 @@
 """The aligners of every survey: `bundle`, `pose`, `position`, and `auto`, which chooses."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -23,6 +24,7 @@ from skyquilt.geometry.camera import project
 from skyquilt.geometry.frames import cam_R_map_from_angles
 from skyquilt.model.camera import Camera
 from skyquilt.model.features import Features
+from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, Pose, Prior
 
 SHOWN_ALREADY = 0.8
@@ -32,11 +34,13 @@ would show.
 NEIGHBOURS = 40
 """So many of the nearest connected photos are asked."""
 KEYPOINTS = 8
-"""A photo with fewer shows next to nothing: a lens cap, a white sky."""
+"""A photo with fewer shows next to nothing: a lens cap without noise, a white sky."""
 TONE_PX, BLACK, WHITE = 64, 12, 243
 """Longest side in px of a picture that is asked whether it is black or white all over, and the
 levels of 255 below and above which it is.
 """
+ONE_TONE = "it is black or white all over"
+"""The reason recorded for such a photo."""
 REQUESTED = "asked for"
 """The reason recorded for a method that the user requested."""
 
@@ -49,7 +53,7 @@ class ByLinks:
 
     bundle: Bundle = field(default_factory=Bundle)
     """The adjustment."""
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
     needs_links: ClassVar[bool] = True
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -119,7 +123,7 @@ class Auto:
     """For linked photos."""
     pose: ByReport
     """For photos that only have positions."""
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
     needs_links: ClassVar[bool] = True
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -219,8 +223,8 @@ def with_loose_photos(alignment: Alignment, inputs: AlignmentInputs) -> Alignmen
             reason = "it could not be linked to the other photos, and it has"
             rejected[i] = rejected.get(i, f"{reason} {lacking} to place it by")
             continue
-        if one_tone(inputs, i):
-            rejected[i] = "it is black or white all over"
+        if one_tone(photo, partial(inputs.grey, i)):
+            rejected[i] = ONE_TONE
             notes.append(f"{photo.name} is left out: {rejected[i]}.")
             continue
         weak = rejected.pop(i, "it could not be linked to any other photo")
@@ -246,14 +250,14 @@ def with_loose_photos(alignment: Alignment, inputs: AlignmentInputs) -> Alignmen
     )
 
 
-def one_tone(inputs: AlignmentInputs, i: int) -> bool:
-    """Whether a photo is black or white all over: a lens cap, a failed exposure. It would be drawn
-    as a hole in the map. Measured values are none.
+def one_tone(photo: Photo, grey: Callable[[int], NDArray[np.uint8]]) -> bool:
+    """Whether a photo without links is black or white all over: a lens cap, a failed exposure. It
+    would be drawn as a hole in the map. Measured values are none. `grey`: the photo in grey, by its
+    longest side; in a small one the noise of the sensor, in which features are found, is gone.
     """
-    photo = inputs.photos[i]
-    if photo.dtype != "uint8" or photo.unit or len(inputs.features[i].px) >= KEYPOINTS:
+    if photo.dtype != "uint8" or photo.unit:
         return False
-    dark, light = np.percentile(inputs.grey(i, TONE_PX), [1, 99])
+    dark, light = np.percentile(grey(TONE_PX), [1, 99])
     return bool(light < BLACK or dark > WHITE)
 
 

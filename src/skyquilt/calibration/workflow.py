@@ -17,7 +17,7 @@ from skyquilt.calibration.deviations import widened
 from skyquilt.calibration.few_views import FewViews, cannot_know
 from skyquilt.calibration.find_board import FindBoard
 from skyquilt.engine.clock import Clock, Steps
-from skyquilt.engine.folder import claim
+from skyquilt.engine.folder import claimed
 from skyquilt.engine.store import Store
 from skyquilt.engine.workers import Threads
 from skyquilt.errors import RefusedError, UsageError
@@ -97,62 +97,66 @@ def iter_calibrate(
         )
     survey = read_survey(frames)
     one_camera(survey.photos)
-    claim(output, calibrate_files.CONTRACT, overwrite=overwrite)
-    clock = Clock(
-        store=Store(folder=output, registry={}),
-        began=began,
-        workers=Threads(settings.jobs or os.cpu_count() or 1),
-    )
-    board = settings.board
-    seen = yield from clock.stage(
-        "boards",
-        look(
-            survey.photos,
-            board,
-            FindBoard(),
-            settings.series,
-            clock.workers,
-            WEIGHTS[settings.weights](),
-        ),
-    )
-    unread = (RejectedView(name=r.name, reason=r.reason) for r in survey.rejected)
-    seen = replace(seen, rejected=(*unread, *seen.rejected))
-    few = settings.few_views and 1 <= len(seen.views) < FEWEST_VIEWS
-    if not few:
-        _enough(seen)
-    yield Note(
-        text=f"the board was found in {len(seen.views)} of {len(seen.views) + len(seen.rejected)}"
-        " views"
-    )
-    key = survey.photos[0].camera_key
-    if few:
-        focal = survey.photos[0].focal
-        prior = FewViews(
-            focal_px=settings.focal_px or focal.px,
-            sigma_px=STATED * settings.focal_px if settings.focal_px else focal.sigma_px,
+    with claimed(output, calibrate_files.CONTRACT, overwrite=overwrite):
+        clock = Clock(
+            store=Store(folder=output, registry={}),
+            began=began,
+            workers=Threads(settings.jobs or os.cpu_count() or 1),
         )
-        both = yield from clock.stage("calibrate", _with_priors(seen, board, prior))
-        open_ = cannot_know(both[0], prior)
-        work = calibrate_files.finish(output, seen, board, key, *both, None, clock, frames, open_)
+        board = settings.board
+        seen = yield from clock.stage(
+            "boards",
+            look(
+                survey.photos,
+                board,
+                FindBoard(),
+                settings.series,
+                clock.workers,
+                WEIGHTS[settings.weights](),
+            ),
+        )
+        unread = (RejectedView(name=r.name, reason=r.reason) for r in survey.rejected)
+        seen = replace(seen, rejected=(*unread, *seen.rejected))
+        few = settings.few_views and 1 <= len(seen.views) < FEWEST_VIEWS
+        if not few:
+            _enough(seen)
+        yield Note(
+            text=f"the board was found in {len(seen.views)} of"
+            f" {len(seen.views) + len(seen.rejected)} views"
+        )
+        key = survey.photos[0].camera_key
+        if few:
+            focal = survey.photos[0].focal
+            prior = FewViews(
+                focal_px=settings.focal_px or focal.px,
+                sigma_px=STATED * settings.focal_px if settings.focal_px else focal.sigma_px,
+            )
+            both = yield from clock.stage("calibrate", _with_priors(seen, board, prior))
+            open_ = cannot_know(both[0], prior)
+            work = calibrate_files.finish(
+                output, seen, board, key, *both, None, clock, frames, open_
+            )
+            figures = yield from clock.stage("report", work)
+            yield from (Note(text=sentence) for sentence in open_)
+            yield Result(output=output, metrics=figures)
+            return
+        centres, corners = Calibrate(), Calibrate(marks="corners")
+        seen, by_centres, by_corners = yield from clock.stage(
+            "calibrate", _calibrated(seen, board, centres, corners)
+        )
+        yield from (Note(text=f"{r.name} was left out: {r.reason}") for r in seen.rejected)
+        _determined(by_centres)
+        judged = yield from clock.stage(
+            "judge",
+            calibrate_judging.judge(
+                seen.views, board, (centres, corners), (by_centres, by_corners)
+            ),
+        )
+        work = calibrate_files.finish(
+            output, seen, board, key, by_centres, by_corners, judged, clock, frames
+        )
         figures = yield from clock.stage("report", work)
-        yield from (Note(text=sentence) for sentence in open_)
         yield Result(output=output, metrics=figures)
-        return
-    centres, corners = Calibrate(), Calibrate(marks="corners")
-    seen, by_centres, by_corners = yield from clock.stage(
-        "calibrate", _calibrated(seen, board, centres, corners)
-    )
-    yield from (Note(text=f"{r.name} was left out: {r.reason}") for r in seen.rejected)
-    _determined(by_centres)
-    judged = yield from clock.stage(
-        "judge",
-        calibrate_judging.judge(seen.views, board, (centres, corners), (by_centres, by_corners)),
-    )
-    work = calibrate_files.finish(
-        output, seen, board, key, by_centres, by_corners, judged, clock, frames
-    )
-    figures = yield from clock.stage("report", work)
-    yield Result(output=output, metrics=figures)
 
 
 def calibrate(

@@ -85,6 +85,13 @@ def command(
         ),
     ] = False,
     thermal_unit: ThermalUnit = None,
+    band: Annotated[
+        str | None,
+        typer.Option(
+            help="Band that the map shows, of cameras that write a file for each, e.g. nir.",
+            show_default="(that of the first file)",
+        ),
+    ] = None,
     shutter: Shutter = None,
     shutter_readout: ShutterReadout = None,
     vertical_datum: Annotated[
@@ -149,6 +156,7 @@ def command(
         reposition=reposition,
         deterministic=deterministic,
         thermal_unit=thermal_unit,
+        band=band,
         shutter=shutter,
         shutter_readout_ms=shutter_readout,
         vertical_datum=vertical_datum,

@@ -20,8 +20,8 @@ def run() -> None:
     exit code.
 
     Wrong options end with 2 (as all usage errors), and so do names that the system refuses; an
-    interrupt with 130. Any other exception is a
-    bug in the program: its traceback is shown, and the exit code is 1.
+    interrupt with 130. A system that gives no more memory is told in a sentence too. Any other
+    exception is a bug in the program: its traceback is shown, and the exit code is 1.
     """
     # threads work on different photos; threads within one matrix product would only wait
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -48,6 +48,17 @@ def run() -> None:
         sys.exit(UsageError.exit_code)
     except KeyboardInterrupt:
         interrupt.leave()
+    except Exception as error:
+        from skyquilt.outside import out_of_memory, shown
+
+        if not out_of_memory(error):
+            raise
+        why = f" ({shown(error, 300)})" if str(error) else ""
+        sys.stderr.write(
+            f"skyquilt: the system gives no more memory{why}; close other programs, or allow the"
+            " program more, and run the same command again\n"
+        )
+        sys.exit(SkyquiltError.exit_code)
     except SystemExit as end:
         if end.code == interrupt.CODE:  # typer ends like this, without a message
             interrupt.leave()

@@ -189,9 +189,8 @@ def mosaic_summary(result: Result) -> str:
             f" {seam['median']} px"
             f" (median; {seam['measured']} of {seam['attempted']} measured)"
         )
-    lines += [
-        f"left out: {name}: {reason}" for name, reason in list(m["photos_rejected"].items())[:10]
-    ]
+    for rejected in (m["photos_rejected"], m.get("thermal", {}).get("photos_rejected", {})):
+        lines += [f"left out: {name}: {reason}" for name, reason in list(rejected.items())[:10]]
     lines += [f"warning: {told}" for told in m.get("warnings", [])]
     if m["metadata_conflicts"]:
         lines.append(

@@ -18,7 +18,7 @@ from skyquilt.coregistration.methods import RegisterSettings, registration_metho
 from skyquilt.coregistration.pictures import Source, guess_of, open_picture
 from skyquilt.coregistration.stated_error import StatedError, state_error, tolerated
 from skyquilt.engine.clock import cpu_seconds
-from skyquilt.engine.folder import claim
+from skyquilt.engine.folder import claimed
 from skyquilt.errors import RefusedError
 from skyquilt.model.event import Event, Note, Result, StageFinished, StageStarted
 from skyquilt.model.photo import RejectedPhoto
@@ -58,31 +58,31 @@ def iter_register(
     """
     settings, output = settings or RegisterSettings(), Path(output)
     opened = open_picture(Path(a)), open_picture(Path(b))
-    claim(output, CONTRACT, overwrite=overwrite)
-    yield StageStarted(stage="register", total=1)
-    began, cpu = time.perf_counter(), cpu_seconds()
-    told = _told(opened, settings)
-    yield StageFinished(
-        stage="register",
-        seconds=round(time.perf_counter() - began, 3),
-        cpu_seconds=round(cpu_seconds() - cpu, 3),
-        reused=False,
-    )
-    record = as_record(told.outcome, settings.method, told.guess, told.stated)
-    record |= {
-        "a": str(a),
-        "b": str(b),
-        "cpu_seconds": round(told.cpu_s, 3),
-        "version": __version__,
-    }
-    if isinstance(told.outcome, Registration):
-        if told.outcome.note:
-            yield Note(text=told.outcome.note)
-        yield from _drawn(output, opened, told.outcome)
-    _write(output, record, opened, told.outcome)
-    yield Result(output=output, metrics=record)
-    if isinstance(told.outcome, RefusedRegistration):
-        raise RefusedError(f"refused: {told.outcome.reason}")
+    with claimed(output, CONTRACT, overwrite=overwrite):
+        yield StageStarted(stage="register", total=1)
+        began, cpu = time.perf_counter(), cpu_seconds()
+        told = _told(opened, settings)
+        yield StageFinished(
+            stage="register",
+            seconds=round(time.perf_counter() - began, 3),
+            cpu_seconds=round(cpu_seconds() - cpu, 3),
+            reused=False,
+        )
+        record = as_record(told.outcome, settings.method, told.guess, told.stated)
+        record |= {
+            "a": str(a),
+            "b": str(b),
+            "cpu_seconds": round(told.cpu_s, 3),
+            "version": __version__,
+        }
+        if isinstance(told.outcome, Registration):
+            if told.outcome.note:
+                yield Note(text=told.outcome.note)
+            yield from _drawn(output, opened, told.outcome)
+        _write(output, record, opened, told.outcome)
+        yield Result(output=output, metrics=record)
+        if isinstance(told.outcome, RefusedRegistration):
+            raise RefusedError(f"refused: {told.outcome.reason}")
 
 
 def register(

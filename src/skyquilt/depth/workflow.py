@@ -36,7 +36,7 @@ from skyquilt.depth.page import depth_page
 from skyquilt.depth.pair_scale import PairScale, pair_scale, scaled
 from skyquilt.depth.pairs import NoField, OnePlane, PairField, pair_field
 from skyquilt.engine.clock import Clock, Steps
-from skyquilt.engine.folder import STATE, claim
+from skyquilt.engine.folder import STATE, claimed
 from skyquilt.engine.store import Store
 from skyquilt.engine.workers import Threads
 from skyquilt.errors import RefusedError, UsageError
@@ -102,25 +102,25 @@ def iter_depth(
     if not given.survey.clips:
         _enough(given)
     former = former_fields(output)
-    claim(output, FILES, overwrite=overwrite)
-    for path in former:
-        path.unlink(missing_ok=True)
-    clock = Clock(
-        store=Store(folder=output / STATE / "store", registry=REGISTRY),
-        began=began,
-        workers=Threads(settings.running.threads),
-    )
-    yield from (Note(text=n) for n in given.survey.notes)
-    given = yield from frames_added(given, settings, clock)
-    survey = given.survey
-    _enough(given)
-    if route == "auto":
-        route = "pair" if len(survey.photos) == 2 else "reconstruction"
-    scene, depth = yield from _by_route(route, given, settings, relief_m, clock)
-    record = yield from clock.stage("draw", _drawn(output, route, scene, depth))
-    record |= {"cpu_seconds": round(clock.cpu_total(), 2), "photos_total": len(survey.photos)}
-    write_text(output / "depth.json", json.dumps(record, indent=1, allow_nan=False) + "\n")
-    yield Result(output=output, metrics=record)
+    with claimed(output, FILES, overwrite=overwrite):
+        for path in former:
+            path.unlink(missing_ok=True)
+        clock = Clock(
+            store=Store(folder=output / STATE / "store", registry=REGISTRY),
+            began=began,
+            workers=Threads(settings.running.threads),
+        )
+        yield from (Note(text=n) for n in given.survey.notes)
+        given = yield from frames_added(given, settings, clock)
+        survey = given.survey
+        _enough(given)
+        if route == "auto":
+            route = "pair" if len(survey.photos) == 2 else "reconstruction"
+        scene, depth = yield from _by_route(route, given, settings, relief_m, clock)
+        record = yield from clock.stage("draw", _drawn(output, route, scene, depth))
+        record |= {"cpu_seconds": round(clock.cpu_total(), 2), "photos_total": len(survey.photos)}
+        write_text(output / "depth.json", json.dumps(record, indent=1, allow_nan=False) + "\n")
+        yield Result(output=output, metrics=record)
 
 
 def _enough(given: SurveyInput) -> None:

@@ -3,7 +3,8 @@
 import errno
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -149,29 +150,44 @@ def open_run(
     return folder
 
 
-def claim(path: Path, names: Sequence[str], *, overwrite: bool) -> None:
+@contextmanager
+def claimed(path: Path, names: Sequence[str], *, overwrite: bool) -> Iterator[None]:
     """Creates the folder, or removes the files `names` of an earlier run from it; other files stay.
+    Inside, no other run writes to the folder.
 
     Raises:
-        OutputError: the folder holds files and `overwrite` is not set, is a file, or cannot be
-            written.
+        OutputError: the folder holds files and `overwrite` is not set, is a file, cannot be
+            written, or another run works in it.
     """
     if path.exists() and not path.is_dir():
         raise OutputError(f"{path} is a file; the output is a folder")
     try:
-        if path.is_dir() and any(path.iterdir()) and not overwrite:
-            raise OutputError(
-                f"{path} already holds files; add --overwrite to replace its results, or choose"
-                " another folder"
-            )
-        path.mkdir(parents=True, exist_ok=True)
-        for name in names:
-            (path / name).unlink(missing_ok=True)
-        probe = path / ".probe"
-        probe.write_bytes(b"x")
-        probe.unlink()
+        _refuse_files(path, overwrite)
+        (path / STATE).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise refusal(path, error) from error
+    lock = FolderLock(path, f"{STATE}/{LOCK}", "run")
+    try:
+        try:
+            _refuse_files(path, overwrite)  # of a run that ended just now
+            for name in names:
+                (path / name).unlink(missing_ok=True)
+            probe = path / ".probe"
+            probe.write_bytes(b"x")
+            probe.unlink()
+        except OSError as error:
+            raise refusal(path, error) from error
+        yield
+    finally:
+        lock.remove()
+
+
+def _refuse_files(path: Path, overwrite: bool) -> None:
+    if not overwrite and path.is_dir() and any(p.name != STATE for p in path.iterdir()):
+        raise OutputError(
+            f"{path} already holds files; add --overwrite to replace its results, or choose"
+            " another folder"
+        )
 
 
 FULL = (errno.ENOSPC, errno.EDQUOT)

@@ -29,15 +29,9 @@ class FolderLock:
         Raises:
             OutputError: the folder cannot be written, or another process holds the lock.
         """
-        self.path = folder / name
+        self.folder, self.path, self._handle = folder, folder / name, -1
         try:
-            self._handle = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-        except OSError as error:
-            raise OutputError(
-                f"cannot write to {folder}: {error.strerror or error}; choose another output folder"
-            ) from error
-        try:
-            self._lock()
+            self._take()
             self.tell("")
         except (BlockingIOError, PermissionError) as error:
             self.close()
@@ -47,9 +41,24 @@ class FolderLock:
             ) from error
         except OSError as error:
             self.close()
-            raise OutputError(
-                f"cannot write to {folder}: {error.strerror or error}; choose another output folder"
-            ) from error
+            raise self._unwritable(error) from error
+
+    def _unwritable(self, error: OSError) -> OutputError:
+        why = error.strerror or error
+        return OutputError(f"cannot write to {self.folder}: {why}; choose another output folder")
+
+    def _take(self) -> None:
+        """Opens and locks the file; again where another process removed it in between."""
+        while True:
+            try:
+                self._handle = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            except OSError as error:
+                raise self._unwritable(error) from error
+            self._lock()
+            with suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(self._handle), self.path.stat()):
+                    return
+            self.close()
 
     def _lock(self) -> None:
         if fcntl is None:
@@ -78,6 +87,15 @@ class FolderLock:
         if self._handle >= 0:
             os.close(self._handle)
             self._handle = -1
+
+    def remove(self) -> None:
+        """Removes the file and releases the lock; the file's folder goes too if it is empty."""
+        if fcntl is None:
+            self.close()  # Windows removes no open files
+        with suppress(OSError):
+            self.path.unlink()
+            self.path.parent.rmdir()
+        self.close()
 
     def __del__(self) -> None:
         if getattr(self, "_handle", -1) >= 0:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.aligners import KEYPOINTS, one_tone
 from skyquilt.engine.codec import decode, encode
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.store import Store
@@ -20,7 +21,7 @@ from skyquilt.live.members import Member, Members
 from skyquilt.model.features import Features, Link, numbers
 from skyquilt.workflows.links import link_pair, marked_in
 from skyquilt.workflows.methods import Methods
-from skyquilt.workflows.photo_features import photo_features
+from skyquilt.workflows.photo_features import photo_features, picture_of
 
 FEATURES_KEPT = 48
 """Number of photos whose features are kept in memory."""
@@ -57,6 +58,15 @@ class LiveLinks:
         while len(self._features) > FEATURES_KEPT:
             self._features.popitem(last=False)
         return look.features
+
+    def shows_nothing(self, number: int, *, compared: bool) -> bool:
+        """Whether a photo without links is black or white all over. One that could not be compared
+        yet may be a dark photo of a flight at night, unless it has hardly any features.
+        """
+        if not compared and len(self.features(number)) >= KEYPOINTS:
+            return False
+        photo = self.members.by_id[number].photo
+        return one_tone(photo, lambda longest: picture_of(self.pixels(number), longest))
 
     def compared(self, member: Member, others: Sequence[int]) -> dict[tuple[int, int], Link | None]:
         """Links to other photos, compared one after the other until there are enough links; None

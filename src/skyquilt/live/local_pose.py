@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.aligners import ONE_TONE
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.local_adjustment import AdjustedWindow, LocalAdjustment, Window
-from skyquilt.errors import AlignmentError
+from skyquilt.errors import AlignmentError, UnreadablePhotoError
 from skyquilt.live.drone_metadata import Metadata
 from skyquilt.live.links import LiveLinks
 from skyquilt.live.members import Member, Members
@@ -61,10 +62,15 @@ class LocalPose:
     def refine(self, member: Member) -> Change:
         """Compares a photo with its neighbours and adjusts it together with them; writes
         nothing.
+
+        Raises:
+            UnreadablePhotoError: it has no links, and is black or white all over.
         """
         links = self.live_links.compared(member, self.neighbours.of(member, member.pose))
         good = {key: k for key, k in links.items() if k is not None}
         if not good:
+            if self.live_links.shows_nothing(member.id, compared=bool(links)):
+                raise UnreadablePhotoError(ONE_TONE)
             why = "it matches none of its neighbours" if links else "there is no photo near it yet"
             return Change(
                 moved={}, cameras={}, camera_of={}, links=links, xyz=np.zeros((0, 3)), reason=why

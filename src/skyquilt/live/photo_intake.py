@@ -150,6 +150,9 @@ class Intake:
             known = self.ledger.row("select id, name from photo where digest = ?", arrived.digest)
             if known is not None:
                 return Accepted(id=int(known[0]), name=str(known[1]), duplicate=True)
+            if photo.shows_a_band and (reason := photo.other_band(self._band(photo))):
+                gone(arrived.path)
+                return self.refuse(name, source, reason)
             same = self.ledger.rows(
                 "select id, name, width from photo where shot = ? and width != ? and state !="
                 " 'superseded'"
@@ -184,6 +187,19 @@ class Intake:
             self.ledger.tell("photo", said)
         hit("photo row committed")
         return Accepted(id=number, name=name)
+
+    def _band(self, photo: Photo) -> str:
+        """The band of multispectral cameras that the map shows: as asked, or the first to arrive. A
+        map of all would be a patchwork of them.
+        """
+        asked = self.settings.band
+        shown = self.ledger.meta("band") if asked is None else asked.lower()
+        if shown is None:
+            shown = photo.band_name
+            self.ledger.put_meta("band", shown)
+            text = f"files of the band {shown} came first: the map shows it, and no other (--band)"
+            self.ledger.tell("note", {"text": text})
+        return str(shown)
 
 
 def shot_of(photo: Photo) -> str:

@@ -47,6 +47,10 @@ class LiveSettings:
     """One of `THERMAL_UNITS`: the unit of values in single-band TIFFs. None = detected, together
     with whether they are thermal.
     """
+    band: str | None = None
+    """Band that the map shows, of cameras that write a file for each; None = that of the first
+    file.
+    """
     shutter: str | None = None
     """One of `settings.SHUTTERS`: how the cameras expose; None = as metadata and table of cameras
     say.
@@ -97,6 +101,7 @@ class LiveSettings:
             "features": self.features,
             "deterministic": self.deterministic,
             "thermal_unit": self.thermal_unit,
+            "band": self.band,
             "shutter": self.shutter,
             "shutter_readout_ms": self.shutter_readout_ms,
             "max_view_angle": self.max_view_angle,

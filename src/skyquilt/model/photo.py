@@ -177,6 +177,20 @@ class Photo:
     """How a JPEG is coded (`photos.headers.JpegHeader.coding`); empty for other files."""
     frame_s: float | None = None
     """Time in s of the frame in the clip that `path` is; None where `path` is a photo."""
+
+    @property
+    def shows_a_band(self) -> bool:
+        """Whether the file shows one band of a multispectral camera."""
+        return bool(self.band_name) and self.channels == 1
+
+    def other_band(self, shown: str) -> str:
+        """The reason why a map of the band `shown` leaves the file out; empty if it shows it too,
+        or is no file of one band.
+        """
+        if not self.shows_a_band or self.band_name == shown:
+            return ""
+        return f"it shows the band {self.band_name}; the map shows {shown} (--band)"
+
     notes: tuple[str, ...] = ()
     """Plain sentences: what is missing, invalid or contradictory."""
 

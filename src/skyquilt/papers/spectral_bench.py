@@ -15,7 +15,7 @@ from skyquilt.coregistration.pictures import guess_of, open_picture
 from skyquilt.coregistration.stated_error import StatedError
 from skyquilt.coregistration.workflow import outcome_of, within_tolerance
 from skyquilt.engine.clock import Clock, cpu_seconds
-from skyquilt.engine.folder import claim
+from skyquilt.engine.folder import claimed
 from skyquilt.geometry.transforms import transfer
 from skyquilt.model.event import Event, Note, Result, StageFinished, StageProgress, StageStarted
 from skyquilt.model.photo import RejectedPhoto
@@ -51,27 +51,32 @@ def iter_spectral_bench(
     for name in methods:
         one_of("--method", name, registry.names("registration"))
     listed = read_pairs(Path(pairs))
-    claim(output, CONTRACT, overwrite=overwrite)
-    began, total = Clock.now(), len(listed) * len(methods)
-    yield StageStarted(stage=STAGE, total=total)
-    rows: list[dict[str, Any]] = []
-    for pair in listed:
-        for method in methods:
-            rows.append(judged(pair, method))
-            yield StageProgress(stage=STAGE, done=len(rows), total=total)
-    seconds, cpu = Clock.now()
-    yield StageFinished(
-        stage=STAGE,
-        seconds=round(seconds - began[0], 3),
-        cpu_seconds=round(cpu - began[1], 3),
-        reused=False,
-    )
-    for line in totals(rows, methods):
-        yield Note(text=line)
-    record = {"pairs": rows, "methods": list(methods), "list": str(pairs), "version": __version__}
-    write_text(output / "report.html", bench_page(record))
-    write_text(output / "bench.json", json.dumps(record, indent=1, allow_nan=False) + "\n")
-    yield Result(output=output, metrics=record)
+    with claimed(output, CONTRACT, overwrite=overwrite):
+        began, total = Clock.now(), len(listed) * len(methods)
+        yield StageStarted(stage=STAGE, total=total)
+        rows: list[dict[str, Any]] = []
+        for pair in listed:
+            for method in methods:
+                rows.append(judged(pair, method))
+                yield StageProgress(stage=STAGE, done=len(rows), total=total)
+        seconds, cpu = Clock.now()
+        yield StageFinished(
+            stage=STAGE,
+            seconds=round(seconds - began[0], 3),
+            cpu_seconds=round(cpu - began[1], 3),
+            reused=False,
+        )
+        for line in totals(rows, methods):
+            yield Note(text=line)
+        record = {
+            "pairs": rows,
+            "methods": list(methods),
+            "list": str(pairs),
+            "version": __version__,
+        }
+        write_text(output / "report.html", bench_page(record))
+        write_text(output / "bench.json", json.dumps(record, indent=1, allow_nan=False) + "\n")
+        yield Result(output=output, metrics=record)
 
 
 def judged(pair: Pair, method: str) -> dict[str, Any]:

@@ -77,7 +77,7 @@ def _is_reduced(photo: Photo, original: Photo) -> bool:
 
 def bands_of(photos: Sequence[Photo]) -> Counter[str]:
     """Photos of each band that files of one channel name."""
-    return Counter(p.band_name for p in photos if _of_a_band(p))
+    return Counter(p.band_name for p in photos if p.shows_a_band)
 
 
 def of_one_band(survey: Survey, wanted: str | None) -> Survey:
@@ -94,13 +94,11 @@ def of_one_band(survey: Survey, wanted: str | None) -> Survey:
     if len(bands) < 2 and wanted is None:
         return survey
     shown = wanted.lower() if wanted is not None else _usual(bands)
-    kept = [p for p in survey.photos if p.band_name == shown or not _of_a_band(p)]
+    kept = [p for p in survey.photos if not p.other_band(shown)]
     out = [
-        RejectedPhoto(
-            name=p.name, reason=f"it shows the band {p.band_name}; the map shows {shown} (--band)"
-        )
+        RejectedPhoto(name=p.name, reason=reason)
         for p in survey.photos
-        if _of_a_band(p) and p.band_name != shown
+        if (reason := p.other_band(shown))
     ]
     return replace(
         survey,
@@ -119,10 +117,6 @@ def band_note(photos: Sequence[Photo]) -> tuple[str, ...]:
         f"Each file shows one band of a multispectral camera: {listed}. A map shows one of them,"
         f" {_usual(bands)} unless --band names another.",
     )
-
-
-def _of_a_band(photo: Photo) -> bool:
-    return bool(photo.band_name) and photo.channels == 1
 
 
 def _usual(bands: Counter[str]) -> str:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from skyquilt.errors import UnreadablePhotoError
 from skyquilt.model.photo import Photo
 from skyquilt.outside import open_regular
-from skyquilt.photos.headers import read_header
+from skyquilt.photos.headers import content_digest, read_header
 from skyquilt.photos.tags import MAKE
 from skyquilt.photos.thermal import thermal_frame_of_jpeg, thermal_frame_of_values
 from skyquilt.video.decoder import frame_of
@@ -45,6 +45,21 @@ def read_gray(photo: Photo, *, reduction: Reduction = 1) -> NDArray[np.uint8]:
     Raises `UnreadablePhotoError` where the data are broken.
     """
     return to_gray(_read(photo, reduction, gray=True))
+
+
+def lost(photo: Photo) -> str:
+    """What became of a photo's file since it was read, as a reason to leave the photo out: gone, no
+    longer readable, or with another content. Empty where nothing did.
+    """
+    try:
+        with open_regular(photo.path):
+            pass
+        same = photo.frame_s is not None or content_digest(photo.path) == photo.digest
+    except FileNotFoundError:
+        return "its file is gone"
+    except OSError as error:
+        return f"its file can no longer be read ({error.strerror or error})"
+    return "" if same else "its file was changed after it had been read"
 
 
 def to_gray(pixels: Pixels) -> NDArray[np.uint8]:

@@ -2,12 +2,13 @@
 
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 
-from skyquilt.engine.folder import claim
+from skyquilt.engine.folder import claimed
 from skyquilt.errors import UsageError
 from skyquilt.model.event import Event, Note, Result, StageFinished, StageStarted
 from skyquilt.planning.coverage import all_seen, counted, make_cells, sight_may_be_blocked
@@ -99,9 +100,11 @@ def refilled(order: Order, output: Path, *, overwrite: bool) -> Iterator[Event]:
     xyz = np.array([(p.x, p.y, p.z - p.ground) for p in plan.points])
     seen = all_seen(cells, view, xyz, np.array([p.yaw for p in plan.points]), blocked=False)
     before = mission.at(cells.centres(np.arange(cells.inside.size))[:, :2])
-    _make_room(output, overwrite)
-    names = write_all(output, plan)
-    write_plan_page(output / "plan.html", plan, cells, counted(cells, seen) + before, order.base)
+    with _room(output, overwrite):
+        names = write_all(output, plan)
+        write_plan_page(
+            output / "plan.html", plan, cells, counted(cells, seen) + before, order.base
+        )
     yield Result(output=output, metrics=summary_of(plan, names))
 
 
@@ -158,9 +161,9 @@ def planned(
     xyz = np.array([p.xyz for p in found])
     yaw = np.array([p.yaw for p in found])
     seen = all_seen(cells, view, xyz, yaw, blocked=sight_may_be_blocked(view, terrain))
-    _make_room(output, overwrite)
-    names = write_all(output, plan)
-    write_plan_page(output / "plan.html", plan, cells, counted(cells, seen), order.base)
+    with _room(output, overwrite):
+        names = write_all(output, plan)
+        write_plan_page(output / "plan.html", plan, cells, counted(cells, seen), order.base)
     yield Result(output=output, metrics=summary_of(plan, names))
 
 
@@ -196,12 +199,12 @@ def terrain_of(
     )
 
 
-def _make_room(output: Path, overwrite: bool) -> None:
-    """Prepares the folder; with `overwrite`, only files of an earlier plan are removed."""
+def _room(output: Path, overwrite: bool) -> AbstractContextManager[None]:
+    """The prepared folder; with `overwrite`, only files of an earlier plan are removed."""
     endings = {w.ending for w in WRITERS.values()}
     old = [p.name for p in output.glob("[0-9][0-9]-*") if p.suffix in endings] \
         if output.is_dir() else []  # fmt: skip
-    claim(output, (*FILES, *old), overwrite=overwrite)
+    return claimed(output, (*FILES, *old), overwrite=overwrite)
 
 
 def write_all(output: Path, plan: Plan) -> list[str]:

@@ -6,14 +6,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skyquilt.coregistration.pictures import guess_of, open_picture
 from skyquilt.coregistration.rig import FindRig, Rig, RigPair
 from skyquilt.coregistration.workflow import outcome_of
+from skyquilt.errors import PhotoFailedError
 from skyquilt.geometry.transforms import transfer
 from skyquilt.imaging.grey import shrink
 from skyquilt.imaging.views import make_views
-from skyquilt.model.photo import Photo, RejectedPhoto
+from skyquilt.model.photo import Photo, RejectedPhoto, Survey
 from skyquilt.model.poses import Alignment, Pose, no_ties
 from skyquilt.model.raster import Window
 from skyquilt.model.registration import RefusedRegistration, Registration
@@ -22,7 +24,8 @@ from skyquilt.ortho.companions import geotransform
 from skyquilt.ortho.compose import Composer
 from skyquilt.ortho.exposure import NEUTRAL, Exposure
 from skyquilt.ortho.radiometry import DriftMethod, balances_drift, drift_of, value_tags
-from skyquilt.photos.pixels import read_color
+from skyquilt.photos.pixels import lost, read_color
+from skyquilt.photos.read import rejected
 from skyquilt.photos.together import taken_together
 from skyquilt.raster import CogWriter, RasterSpec
 from skyquilt.settings import PictureSettings
@@ -49,12 +52,16 @@ class Rigged:
     """Thermal photos taken at the same time as a placed visual one."""
     alignment: Alignment
     """Their poses in the visual map's frame."""
+    rejected: tuple[RejectedPhoto, ...] = ()
+    """Thermal photos that were taken together with a visual one, but cannot be decoded."""
 
 
 def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistration:
     """Places thermal photos by visual poses, or gives the reason why this is not possible."""
     visual, placed = scene.aligned.photos, scene.aligned.alignment
-    pairs = [(i, j) for i, j in taken_together(visual, thermal) if i in placed.poses]
+    together = [(i, j) for i, j in taken_together(visual, thermal) if i in placed.poses]
+    bad = {j: r for _, j in together if (r := _undecodable(thermal[j])) is not None}
+    pairs = [(i, j) for i, j in together if j not in bad]
     if len(pairs) < FindRig.minimum:
         return RefusedRegistration(
             reason=f"{len(pairs)} thermal photos were taken together with a visual one, by time or"
@@ -86,7 +93,32 @@ def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistrati
         blocks=(tuple(poses),),
         ties=no_ties(),
     )
-    return Rigged(rig=rig, photos=tuple(thermal[j] for _, j in pairs), alignment=alignment)
+    photos = tuple(thermal[j] for _, j in pairs)
+    return Rigged(rig=rig, photos=photos, alignment=alignment, rejected=tuple(bad.values()))
+
+
+def _undecodable(photo: Photo) -> RejectedPhoto | None:
+    """Why a frame cannot be drawn; None if it can be. Frames are small: they are decoded again when
+    they are drawn.
+    """
+    try:
+        read_color(photo)
+    except Exception as error:  # whatever it is, it concerns this photo alone
+        return rejected(photo.name, error)
+    return None
+
+
+def _pixels(photo: Photo) -> NDArray[Any]:
+    """Pixels of a frame that could be decoded before.
+
+    Raises:
+        PhotoFailedError: it cannot be any more.
+    """
+    try:
+        return read_color(photo)
+    except Exception as error:
+        reason = lost(photo) or rejected(photo.name, error).reason
+        raise PhotoFailedError(photo.name, f"{reason}; run the same command again") from error
 
 
 def _freedom(photo: Photo) -> float:
@@ -130,7 +162,7 @@ def drift_of_rigged(
     if not balances_drift(settings, unit):
         return NEUTRAL
     views = make_views(found.alignment, ground.surface, ground.limits)
-    frames = {v.photo: shrink(read_color(found.photos[v.photo]), THUMBNAIL)[0] for v in views}
+    frames = {v.photo: shrink(_pixels(found.photos[v.photo]), THUMBNAIL)[0] for v in views}
     return drift_of(views, frames, ground.surface, ground.grid.bounds, unit, drift, settings)
 
 
@@ -147,7 +179,7 @@ def draw_rigged(
         views=make_views(found.alignment, scene.ground.surface, scene.ground.limits),
         surface=scene.ground.surface,
         blend=blend,
-        pixels=lambda i: read_color(found.photos[i]),
+        pixels=lambda i: _pixels(found.photos[i]),
         bands=first.channels,
         dtype=kind,
         exposure=exposure,
@@ -174,7 +206,7 @@ def draw_rigged(
             writer.write_block(block, composed.pixels, composed.photo >= 0)
 
 
-def rig_figures(found: Rigged, total: int) -> dict[str, Any]:
+def rig_figures(found: Rigged, thermal: Survey) -> dict[str, Any]:
     """The entry `thermal` of metrics.json."""
     rig, first = found.rig, found.photos[0]
     return {
@@ -192,5 +224,6 @@ def rig_figures(found: Rigged, total: int) -> dict[str, Any]:
         },
         "thermal_R_visual": rig.b_R_a.tolist(),
         "photos_used": len(found.photos),
-        "photos_total": total,
+        "photos_total": len(thermal.photos) + len(thermal.rejected),
+        "photos_rejected": {p.name: p.reason for p in (*thermal.rejected, *found.rejected)},
     }

@@ -201,7 +201,7 @@ def _by_rig(
     draw_rigged(output / "thermal.tif", found, scene, visual.methods.blend, exposure)
     none = np.zeros((0, 2))
     same = Registration(model="identity", b_H_a=np.eye(3), px_a=none, px_b=none)
-    figures = {"thermal": rig_figures(found, len(thermal.photos) + len(thermal.rejected))}
+    figures = {"thermal": rig_figures(found, thermal)}
     figures["thermal"] |= value_figures(found.photos, exposure, picture)
     pictures = overlays(opened(output / "mosaic.tif"), opened(output / "thermal.tif"), same)
     _leave(output, pictures, metrics, figures)
@@ -238,6 +238,7 @@ def _figures(joined: Joined, heat: Result, b: Source) -> dict[str, Any]:
         "thermal_values": m.get("thermal_values"),
         "photos_used": m["photos_used"],
         "photos_total": m["photos_total"],
+        "photos_rejected": m["photos_rejected"],
         "gsd_m": m["gsd_m"],
         "blocks": m["blocks"],
         "method": m["method"],

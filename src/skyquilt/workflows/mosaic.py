@@ -10,7 +10,7 @@ Start reading at `make_map`. Its steps are those of `skyquilt.workflows.flow`.
 import json
 import shutil
 from collections.abc import Generator, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,7 @@ from skyquilt.ortho.orthomosaic import SPOOL
 from skyquilt.ortho.radiometry import value_figures
 from skyquilt.outside import read_bounded
 from skyquilt.photos.headers import content_digest
+from skyquilt.photos.pixels import lost
 from skyquilt.photos.read import ReadFiles
 from skyquilt.quality.clip_figures import clip_figures
 from skyquilt.quality.placement import placement_quality
@@ -205,8 +206,8 @@ def make_map(
             earlier.check(given.survey.photos, run.path)
         _log(run.path, given.survey.rejected)
         make = _Making(run.path, key, recipe, settings, methods, clock, earlier)
-        metrics, given = yield from _without_bad(given, make)
-    run.finish()
+        metrics, given, key = yield from _without_bad(given, make)
+    replace(run, key=key).finish()
     result = Result(output=run.path, metrics=metrics)
     return FinishedMap(result=result, given=given, methods=methods, settings=settings)
 
@@ -239,34 +240,39 @@ class _Making:
 
 def _without_bad(
     given: SurveyInput, make: _Making
-) -> Generator[Event, None, tuple[dict[str, Any], SurveyInput]]:
-    """Metrics of the map, and the survey that it shows: a photo on which a step fails, or whose
-    file disappears, is left out, and the steps are repeated without it; results that do not depend
-    on it are in the store.
+) -> Generator[Event, None, tuple[dict[str, Any], SurveyInput, str]]:
+    """Metrics of the map, the survey that it shows, and the key of its run.
+
+    A photo on which a step fails, or whose file is no longer the one that was read, is left out,
+    and the steps are repeated without it; results that do not depend on it are in the store. The
+    key is that of a run without the photos whose files are lost: with these files again, the map
+    does not count as finished.
 
     Raises:
         SkyquiltError: more than half of the photos, so it is not the photos that are bad.
     """
-    most = max(1, len(given.survey.photos) // 2)
-    for _ in range(most):
+    total, still, key = len(given.survey.photos), given, make.key
+    while True:
         try:
             metrics = yield from _made(given, make)
-            return metrics, given
+            return metrics, given, key
         except PhotoFailedError as error:
-            failed = RejectedPhoto(name=error.photo, reason=error.reason)
             log_error(make.output, str(error), error)
-        gone = [p for p in given.survey.photos if p.name != failed.name and not p.path.is_file()]
-        lost = [failed, *(RejectedPhoto(name=p.name, reason="its file is gone") for p in gone)]
-        if len(lost) > most:
-            break
-        yield Note(text=f"{failed.name} is left out: it {failed.reason}", warning=True)
-        for photo in lost[1:]:
-            yield Note(text=f"{photo.name} is left out: {photo.reason}", warning=True)
-        given = given.without(lost)
-    raise SkyquiltError(
-        f"{failed.name} and others could be read before, but now {failed.reason.split('now ')[-1]};"
-        " check their disk and run the same command again to resume"
-    )
+            gone = {p.name: reason for p in given.survey.photos if (reason := lost(p))}
+            failed = {error.photo: error.reason} | gone
+        left = len(given.survey.photos) - len(failed)
+        if 2 * left < total:
+            name, reason = next(iter(failed.items()))
+            raise SkyquiltError(
+                f"{total - left} of {total} photos cannot be used any more, first {name}: {reason};"
+                " check their disk and run the same command again to resume"
+            )
+        for name, reason in failed.items():
+            yield Note(text=f"{name} is left out: {reason}", warning=True)
+        given = given.without([RejectedPhoto(name=n, reason=r) for n, r in failed.items()])
+        if gone:
+            still = still.without([RejectedPhoto(name=n, reason=r) for n, r in gone.items()])
+            key = run_key(still, make.settings, make.methods)
 
 
 def _made(given: SurveyInput, make: _Making) -> Generator[Event, None, dict[str, Any]]:

@@ -20,9 +20,9 @@ from skyquilt.errors import NoPhotosError, OutputError, PhotoFailedError, Unread
 from skyquilt.imaging.grey import halved, shrink, to_grey8
 from skyquilt.model.features import Features
 from skyquilt.model.photo import Photo, RejectedPhoto
-from skyquilt.photos.headers import content_digest
+from skyquilt.outside import out_of_memory
 from skyquilt.photos.kept_frames import kept_frame
-from skyquilt.photos.pixels import decode_jpeg, read_color
+from skyquilt.photos.pixels import decode_jpeg, lost, read_color
 from skyquilt.photos.read import rejected
 from skyquilt.workflows.methods import Detector
 
@@ -137,13 +137,16 @@ class PixelsInUse:
 
         Raises:
             PhotoFailedError: a photo that could be read before is lost.
+            MemoryError: there is not enough memory.
         """
         try:
             return self._cache(self._number[photo])
         except Exception as error:  # whatever it is, it concerns this photo alone
             name = self._names[photo]
+            if out_of_memory(error):
+                raise MemoryError(f"it does not suffice to decode {name}") from error
             reason = rejected(name, error).reason
-            raise PhotoFailedError(name, f"could be read before, but now {reason}") from error
+            raise PhotoFailedError(name, f"it could be read before, but now {reason}") from error
 
     def make_room(self) -> None:
         """Drops the photos kept in memory where not all fit."""
@@ -202,8 +205,8 @@ def pixels_of(photo: Photo, store: Store) -> NDArray[Any]:
     """
     if photo.frame_s is None:
         pixels = read_color(photo)
-        if content_digest(photo.path) != photo.digest:
-            raise UnreadablePhotoError("is another photo than the one that was read before")
+        if reason := lost(photo):
+            raise UnreadablePhotoError(reason)
         return pixels
     body = store.get_or(FRAMES, photo.digest, lambda: kept_frame(read_color(photo)))
     return decode_jpeg(body.tobytes())
@@ -284,6 +287,8 @@ def find_features(
 
     Raises:
         NoPhotosError: no photo could be decoded.
+        PhotoFailedError: the file of a photo is no longer the one that was read.
+        MemoryError: there is not enough memory, which is no fault of a photo.
     """
     cv2.setNumThreads(1)  # photos are processed in parallel instead
 
@@ -299,6 +304,10 @@ def find_features(
         except OutputError:  # a full disk is no fault of the photo
             raise
         except Exception as error:  # whatever it is, it concerns this photo alone
+            if out_of_memory(error):
+                raise MemoryError(f"it does not suffice to read {photos[index].name}") from error
+            if reason := lost(photos[index]):  # others may be lost with it
+                raise PhotoFailedError(photos[index].name, reason) from error
             return rejected(photos[index].name, error)
         return None
 
