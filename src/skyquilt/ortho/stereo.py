@@ -101,6 +101,11 @@ class Stereo:
     """
     whole: float = 0.05
     """Size of crowns and of gaps between them, as a share of the flying height."""
+    both_ways: bool = False
+    """Pairs that show things which stand are matched a second time, from the other photo: a side of
+    a crown that is narrow in one photo is wide in the other, and where both hold they are two
+    heights of a place. It doubles the cost.
+    """
     relief: float = 0.02
     """A pair with less relief than this share of the flying height is not matched finely, and
     things that stand are at least as high; 0 = every pair is.
@@ -111,7 +116,7 @@ class Stereo:
     """The ratio that is preferred."""
     cell_px: tuple[int, int] = (4, 8)
     """Least and greatest side of a cell in map pixels."""
-    version: ClassVar[int] = 6
+    version: ClassVar[int] = 7
 
     def __call__(
         self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture, keep: Keep
@@ -230,7 +235,7 @@ class Stereo:
         grid: Grid,
     ) -> list[tuple[Pair, Level]]:
         """The pairs that are matched finely, over the heights known, and at which level: those that
-        show things of at least `least` m at the finest.
+        show things of at least `least` m at the finest, and both ways if that is asked.
         """
         fine, finest = self.fine, replace(self.fine, longest=max(self.finest, self.fine.longest))
         gsds = {n.longest: max(extent / n.longest, grid.gsd) for n in (fine, finest)}
@@ -239,10 +244,12 @@ class Stereo:
             pair = _over(a, b, known, gsds[fine.longest])
             if pair is None or _relief(pair, known) < least:
                 continue
-            sharper = (
-                _over(a, b, known, gsds[finest.longest]) if _steps(pair, known, least) else None
-            )
-            chosen.append((pair, fine) if sharper is None else (sharper, finest))
+            if not _steps(pair, known, least):
+                chosen.append((pair, fine))
+                continue
+            ways = ((a, b), (b, a)) if self.both_ways else ((a, b),)
+            sharper = [_over(*way, known, gsds[finest.longest]) for way in ways]
+            chosen += [(p, finest) for p in sharper if p is not None]
         return chosen
 
 

@@ -193,7 +193,11 @@ def heights_for(settings: MosaicSettings) -> SurfaceFromPictures | None:
     chosen: dict[str, SurfaceFromPictures] = {
         "auto": Stereo(),
         "dense": Stereo(
-            fine=Level(longest=1400, window=3, wanted=4), relief=0.0, edges=0.2, cell_px=(3, 8)
+            fine=Level(longest=1400, window=3, wanted=4),
+            relief=0.0,
+            edges=0.2,
+            both_ways=True,
+            cell_px=(3, 8),
         ),
         "sweep": Sweep(),
     }
