@@ -114,6 +114,8 @@ class Stereo:
     """Least and greatest ratio of baseline to height of a pair."""
     best_base: float = 0.25
     """The ratio that is preferred."""
+    cell: float = 2.0
+    """Side of a cell in pixels of the finest pictures that are matched, within `cell_px`."""
     cell_px: tuple[int, int] = (4, 8)
     """Least and greatest side of a cell in map pixels."""
     version: ClassVar[int] = 7
@@ -137,7 +139,7 @@ class Stereo:
         pairs = self._matched(views, rough, extent, height, least, grid)
         gsd = min((p.gsd for p, _ in pairs), default=extent / self.fine.longest)
         cells = grid.coarser(
-            max(int(np.clip(round(2 * gsd / grid.gsd), *self.cell_px)), least_cell(grid))
+            max(int(np.clip(round(self.cell * gsd / grid.gsd), *self.cell_px)), least_cell(grid))
         )
         step, far = self.agree * height, self.edges * height
         given = _Round(

@@ -197,7 +197,8 @@ def heights_for(settings: MosaicSettings) -> SurfaceFromPictures | None:
             relief=0.0,
             edges=0.2,
             both_ways=True,
-            cell_px=(3, 8),
+            cell=1.5,
+            cell_px=(2, 8),
         ),
         "sweep": Sweep(),
     }
