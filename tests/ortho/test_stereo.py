@@ -349,10 +349,9 @@ def test_cells_are_as_fine_as_asked(flight, asked, wide):
 
 
 @pytest.mark.parametrize("room", [0, 30, 1_000])
-def test_heights_of_pairs_wait_for_later_tiles_as_far_as_there_is_room(room, monkeypatch):
-    monkeypatch.setattr(stereo, "HELD_BYTES", room)
+def test_heights_of_pairs_wait_for_later_tiles_as_far_as_there_is_room(room):
     near = [[0, 1], [1, 2], [2, 3], [0, 1, 3], [], [1, 2]]
-    stays = stereo._staying(near, [10, 20, 10, 40])
+    stays = stereo._staying(near, [10, 20, 10, 40], room)
     matched, before = [0] * 4, list[int]()
     for pairs, stay in zip(near, stays, strict=True):
         for k in set(pairs) - set(before):

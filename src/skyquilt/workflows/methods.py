@@ -197,6 +197,7 @@ def heights_for(settings: MosaicSettings) -> SurfaceFromPictures | None:
             relief=0.0,
             edges=0.2,
             both_ways=True,
+            held_mb=320.0,
             cell=1.5,
             cell_px=(2, 8),
         ),
