@@ -315,11 +315,43 @@ def test_edges_are_sought_where_they_are_asked_for(flight):
     assert off[1] < 0.95 * off[0]
 
 
+def test_a_pair_is_matched_both_ways_where_that_is_asked(flight, monkeypatch):
+    """Two photos: more cells have a height of their own, and these are as true."""
+    views, grey = flight
+    two, known, given, whole = [views[0], views[2]], [], [], stereo._fused
+
+    def fused(round_, pairs, name, keep):
+        z = whole(round_, pairs, name, keep)
+        if name == "fine":
+            given.append([(p.a.photo, p.b.photo) for p, _ in pairs])
+            x = round_.cells.x(np.arange(z.shape[1]))
+            y = round_.cells.y(np.arange(z.shape[0]))
+            outside = np.maximum(np.abs(x), np.abs(y[:, None])) - HALF
+            off = np.abs(z - np.where(outside < 0, BOX, 0.0))[np.abs(outside) > 0.6]
+            assert (off[np.isfinite(off)] < 0.5).mean() > 0.98
+            known.append(np.isfinite(z).sum())
+        return z
+
+    monkeypatch.setattr(stereo, "_fused", fused)
+    for both in (False, True):
+        Stereo(both_ways=both)(level(0.0), two, GRID, grey, MADE_NOW)
+    assert given == [[(0, 2)], [(0, 2), (2, 0)]]
+    assert known[1] > known[0]
+
+
+@pytest.mark.parametrize(("asked", "wide"), [(1.5, 2), (3.0, 3), (9.0, 4)])
+def test_cells_are_as_fine_as_asked(flight, asked, wide):
+    """Pixels of the finest pictures are 0.062 m wide, the map's 0.06 m."""
+    views, grey = flight
+    method = Stereo(finest=800, cell=asked, cell_px=(2, 4))
+    found = method(level(0.0), [views[0], views[2]], GRID, grey, MADE_NOW)
+    assert found.cell == pytest.approx(wide * GRID.gsd)
+
+
 @pytest.mark.parametrize("room", [0, 30, 1_000])
-def test_heights_of_pairs_wait_for_later_tiles_as_far_as_there_is_room(room, monkeypatch):
-    monkeypatch.setattr(stereo, "HELD_BYTES", room)
+def test_heights_of_pairs_wait_for_later_tiles_as_far_as_there_is_room(room):
     near = [[0, 1], [1, 2], [2, 3], [0, 1, 3], [], [1, 2]]
-    stays = stereo._staying(near, [10, 20, 10, 40])
+    stays = stereo._staying(near, [10, 20, 10, 40], room)
     matched, before = [0] * 4, list[int]()
     for pairs, stay in zip(near, stays, strict=True):
         for k in set(pairs) - set(before):

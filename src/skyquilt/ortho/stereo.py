@@ -39,8 +39,6 @@ GreyPicture = Callable[[int, int], NDArray[np.uint8]]
 """Gives the grey image (h, w) of a photo (index), reduced to the given px on its longest side."""
 TILE = 512
 """Cells along a side of the pieces in which heights are fused."""
-HELD_BYTES = 6.4e7
-"""Bytes of heights of pairs, about, that wait in memory for later tiles."""
 NEW = 0.25
 """Share of the ground of a pair that must still lack pairs for it to be matched."""
 EDGES = 0.003
@@ -73,6 +71,8 @@ class _Round:
     """Source of the photos' grey images."""
     agree: float
     """Heights of different pairs that agree differ by less than this in m."""
+    held_bytes: float
+    """Bytes of heights of pairs, about, that wait in memory for later tiles."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,6 +101,11 @@ class Stereo:
     """
     whole: float = 0.05
     """Size of crowns and of gaps between them, as a share of the flying height."""
+    both_ways: bool = False
+    """Pairs that show things which stand are matched a second time, from the other photo: a side of
+    a crown that is narrow in one photo is wide in the other, and where both hold they are two
+    heights of a place. It doubles the cost.
+    """
     relief: float = 0.02
     """A pair with less relief than this share of the flying height is not matched finely, and
     things that stand are at least as high; 0 = every pair is.
@@ -109,9 +114,15 @@ class Stereo:
     """Least and greatest ratio of baseline to height of a pair."""
     best_base: float = 0.25
     """The ratio that is preferred."""
+    held_mb: float = 64.0
+    """Heights of pairs in MB, about, that wait in memory for later tiles: pairs that do not fit are
+    matched again.
+    """
+    cell: float = 2.0
+    """Side of a cell in pixels of the finest pictures that are matched, within `cell_px`."""
     cell_px: tuple[int, int] = (4, 8)
     """Least and greatest side of a cell in map pixels."""
-    version: ClassVar[int] = 6
+    version: ClassVar[int] = 7
 
     def __call__(
         self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture, keep: Keep
@@ -132,7 +143,7 @@ class Stereo:
         pairs = self._matched(views, rough, extent, height, least, grid)
         gsd = min((p.gsd for p, _ in pairs), default=extent / self.fine.longest)
         cells = grid.coarser(
-            max(int(np.clip(round(2 * gsd / grid.gsd), *self.cell_px)), least_cell(grid))
+            max(int(np.clip(round(self.cell * gsd / grid.gsd), *self.cell_px)), least_cell(grid))
         )
         step, far = self.agree * height, self.edges * height
         given = _Round(
@@ -141,6 +152,7 @@ class Stereo:
             high=_stretched(rough, max(3 * gsd, far / 2), cv2.MORPH_DILATE, step),
             grey=grey,
             agree=0.015 * height,
+            held_bytes=1e6 * self.held_mb,
         )
         z, agree = _fused(given, pairs, "fine", keep), given.agree
         del given, pairs  # large surveys have rasters of 100 MB
@@ -172,6 +184,7 @@ class Stereo:
             high=replace(surface, z=surface.z + np.float32(self.above * height)),
             grey=grey,
             agree=0.04 * height,
+            held_bytes=1e6 * self.held_mb,
         )
         pairs = [
             (p, self.coarse)
@@ -230,7 +243,7 @@ class Stereo:
         grid: Grid,
     ) -> list[tuple[Pair, Level]]:
         """The pairs that are matched finely, over the heights known, and at which level: those that
-        show things of at least `least` m at the finest.
+        show things of at least `least` m at the finest, and both ways if that is asked.
         """
         fine, finest = self.fine, replace(self.fine, longest=max(self.finest, self.fine.longest))
         gsds = {n.longest: max(extent / n.longest, grid.gsd) for n in (fine, finest)}
@@ -239,10 +252,12 @@ class Stereo:
             pair = _over(a, b, known, gsds[fine.longest])
             if pair is None or _relief(pair, known) < least:
                 continue
-            sharper = (
-                _over(a, b, known, gsds[finest.longest]) if _steps(pair, known, least) else None
-            )
-            chosen.append((pair, fine) if sharper is None else (sharper, finest))
+            if not _steps(pair, known, least):
+                chosen.append((pair, fine))
+                continue
+            ways = ((a, b), (b, a)) if self.both_ways else ((a, b),)
+            sharper = [_over(*way, known, gsds[finest.longest]) for way in ways]
+            chosen += [(p, finest) for p in sharper if p is not None]
         return chosen
 
 
@@ -258,7 +273,8 @@ def _fused(given: _Round, pairs: Sequence[tuple[Pair, Level]], name: str, keep: 
     near = {tile: _near(pairs, cells, at) for tile, at in tiles.items()}
     missing = keep.missing(tiles)
     sizes = [8 * p.size[0] * p.size[1] * min(1.0, p.gsd / cells.gsd) ** 2 for p, _ in pairs]
-    stays = dict(zip(missing, _staying([near[tile] for tile in missing], sizes), strict=True))
+    staying = _staying([near[tile] for tile in missing], sizes, given.held_bytes)
+    stays = dict(zip(missing, staying, strict=True))
     order, before = list[int](), list[int]()
     for tile in missing:
         order += [k for k in near[tile] if k not in before]
@@ -282,10 +298,12 @@ def _fused(given: _Round, pairs: Sequence[tuple[Pair, Level]], name: str, keep: 
     return out
 
 
-def _staying(near: Sequence[Sequence[int]], sizes: Sequence[float]) -> list[list[int]]:
+def _staying(
+    near: Sequence[Sequence[int]], sizes: Sequence[float], held_bytes: float
+) -> list[list[int]]:
     """The pairs whose heights stay in memory after each tile, from the pairs near each: those near
-    the next one, and those that later tiles need, the next needed first, as many as `HELD_BYTES`
-    bear. `sizes`: bytes of the heights of each pair, about.
+    the next one, and those that later tiles need, the next needed first, as many as
+    `held_bytes` bear. `sizes`: bytes of the heights of each pair, about.
     """
     needed: dict[int, list[int]] = {}
     for number, pairs in enumerate(near):
@@ -299,7 +317,7 @@ def _staying(near: Sequence[Sequence[int]], sizes: Sequence[float]) -> list[list
             for k in known
             if (at := bisect_right(after := needed[k], number)) < len(after)
         ]
-        stay, room = list[int](), HELD_BYTES
+        stay, room = list[int](), held_bytes
         for when, k in sorted(later):
             room -= sizes[k]
             if when == number + 1 or room >= 0:

@@ -195,7 +195,13 @@ def heights_for(settings: MosaicSettings) -> SurfaceFromPictures | None:
     chosen: dict[str, SurfaceFromPictures] = {
         "auto": Stereo(),
         "dense": Stereo(
-            fine=Level(longest=1400, window=3, wanted=4), relief=0.0, edges=0.2, cell_px=(3, 8)
+            fine=Level(longest=1400, window=3, wanted=4),
+            relief=0.0,
+            edges=0.2,
+            both_ways=True,
+            held_mb=320.0,
+            cell=1.5,
+            cell_px=(2, 8),
         ),
         "sweep": Sweep(),
     }
