@@ -1,14 +1,17 @@
-"""Cameras in the formats of OpenSfM and OpenDroneMap: lengths in units of the longer side, from the
-image centre.
+"""Cameras in the formats of other software.
 
-Both put the origin at ((w - 1) / 2, (h - 1) / 2) with pixel centres at integers. Their distortion
-runs from undistorted to distorted as OpenCV's does, so coefficients keep their signs.
+OpenSfM and OpenDroneMap give lengths in units of the longer side, from the image centre. Both put
+the origin at ((w - 1) / 2, (h - 1) / 2) with pixel centres at integers. Their distortion runs from
+undistorted to distorted as OpenCV's does, so coefficients keep their signs.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
+from skyquilt.geometry.camera import FURTHEST
 from skyquilt.model.camera import Camera
 from skyquilt.outside import plain, real
 
@@ -118,3 +121,30 @@ def _number(record: Mapping[str, Any], key: str, otherwise: float | None = None)
             f"its '{key}' is {plain(repr(value), 60)}; expected a number of at most {most:g}"
         )
     return number
+
+
+def radial_of_rational(
+    k: tuple[float, float, float], rational: Sequence[float], radius: float
+) -> tuple[float, float, float]:
+    """k1, k2, k3 that come closest to OpenCV's rational model (1 + k1 r^2 + k2 r^4 + k3 r^6) /
+    (1 + k4 r^2 + k5 r^4 + k6 r^6) over a picture; `radius` of its corners in units of the focal
+    length. NaN where the model has a pole in the picture.
+    """
+    r = np.linspace(0, radius, 200)[1:]
+    powers = np.stack([r**2, r**4, r**6], axis=1)
+    wanted = (1 + powers @ np.array(k)) / (1 + powers @ np.array(rational)) - 1
+    if not np.isfinite(wanted).all():
+        return math.nan, math.nan, math.nan
+    found = np.linalg.lstsq(powers * r[:, None], wanted * r, rcond=None)[0]
+    return float(found[0]), float(found[1]), float(found[2])
+
+
+def angular_of_pix4d(rho: Sequence[float], radius: float) -> list[float]:
+    """Coefficients of the angle from the axis in rad, of its 3rd, 5th and 7th power, that come
+    closest to Pix4D's fisheye: the polynomial `rho`, lowest degree first, of the angle over a right
+    angle; `radius` of a picture's corners in units of the affine matrix.
+    """
+    angle = np.linspace(0, min(radius * math.pi / 2, FURTHEST), 200)[1:]
+    wanted = np.polyval(list(reversed(rho)), angle * 2 / math.pi)
+    powers = np.stack([angle, angle**3, angle**5, angle**7], axis=1)
+    return [float(n) for n in np.linalg.lstsq(powers, wanted, rcond=None)[0]]

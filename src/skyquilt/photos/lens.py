@@ -9,8 +9,7 @@ from functools import cache
 from importlib.resources import files
 from typing import Literal
 
-import numpy as np
-
+from skyquilt.geometry.camera_formats import angular_of_pix4d, radial_of_rational
 from skyquilt.model.camera import ADJUSTABLE, Camera
 from skyquilt.model.photo import Focal
 from skyquilt.outside import plain
@@ -225,8 +224,6 @@ another setting of the focus, another camera of the model.
 """
 _SIGMA_RADIAL, _SIGMA_TANGENTIAL, _SIGMA_ASPECT = 0.02, 0.004, 0.0015
 """Deviations of its distortion coefficients and of its ratio of focal lengths."""
-_FURTHEST = 1.4
-"""Angle from the axis in rad up to which a fisheye's polynomial is taken over."""
 _UNTOLD = (0.1, 0.1, 0.05, 0.002, 0.002, 0.003)
 """Deviations of k1, k2, k3, p1, p2 and the ratio where a calibration gives only lengths."""
 
@@ -318,26 +315,11 @@ def _dewarped(numbers: Sequence[float], flat: bool, size: tuple[int, int]) -> Ca
     if not (fx > 0 and fy > 0):
         return f"a focal length of {fx:.4g}, {fy:.4g} px"
     if any(rational):
-        k1, k2, k3 = _polynomial((k1, k2, k3), rational, math.hypot(*size) / 2 / fx)
+        k1, k2, k3 = radial_of_rational((k1, k2, k3), rational, math.hypot(*size) / 2 / fx)
     if flat:
         k1 = k2 = k3 = p1 = p2 = 0.0
     centre = (cx + size[0] / 2, cy + size[1] / 2)
     return _camera(size, fx, centre, (k1, k2, k3, p1, p2), aspect=fy / fx)
-
-
-def _polynomial(
-    k: tuple[float, float, float], rational: Sequence[float], radius: float
-) -> tuple[float, float, float]:
-    """k1, k2, k3 that come closest to (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 +
-    k6 r^6) over a picture; `radius` of its corners in units of the focal length.
-    """
-    r = np.linspace(0, radius, 200)[1:]
-    powers = np.stack([r**2, r**4, r**6], axis=1)
-    wanted = (1 + powers @ np.array(k)) / (1 + powers @ np.array(rational)) - 1
-    if not np.isfinite(wanted).all():
-        return math.nan, math.nan, math.nan
-    found = np.linalg.lstsq(powers * r[:, None], wanted * r, rcond=None)[0]
-    return float(found[0]), float(found[1]), float(found[2])
 
 
 def _perspective(
@@ -380,12 +362,7 @@ def _fisheye(
     px_per_mm = _px_per_mm(exif, sensor, size)
     middle = (size[0] / 2, size[1] / 2)
     centre = middle if px_per_mm is None else _principal_point(xmp, px_per_mm, size)
-    unit = 2 / math.pi
-    reach = min(math.hypot(*size) / 2 / (matrix[0] * unit), _FURTHEST)
-    angle = np.linspace(0, reach, 200)[1:]
-    wanted = np.polyval(list(reversed(rho or (0.0, 1.0))), angle * unit)
-    powers = np.stack([angle, angle**3, angle**5, angle**7], axis=1)
-    first, *higher = (float(n) for n in np.linalg.lstsq(powers, wanted, rcond=None)[0])
+    first, *higher = angular_of_pix4d(rho or (0.0, 1.0), math.hypot(*size) / 2 / matrix[0])
     if not first > 0:
         return f"a polynomial of {', '.join(f'{n:.4g}' for n in rho)}"
     k1, k2, k3 = (n / first for n in higher)
