@@ -3,7 +3,7 @@
 import json
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,10 +46,20 @@ class Flight:
 
 
 def made(temporary: pytest.TempPathFactory, name: str, **settings: Any) -> Flight:
-    """A flight of 480 x 360 px."""
-    flown = FlightSettings(lens=Lens().scaled(480, 360), **settings)
+    """A flight of 480 x 360 px, unless `settings` have another lens."""
+    flown = FlightSettings(**{"lens": Lens().scaled(480, 360), **settings})
     folder = flown_once(temporary, name, flown)
     return Flight(folder=folder, truth=json.loads((folder / "truth" / "truth.json").read_text()))
+
+
+def fed(live: LiveMap, paths: Sequence[Path]) -> LiveMap:
+    """The map after it has worked on all these photos, and on what waits for quiet."""
+    for path in paths:
+        live.add(path)
+    live.blocks.last_arrival = -1e9  # as if it had been quiet for long
+    for _ in live.drain_all():
+        pass
+    return live
 
 
 @pytest.fixture(scope="session")

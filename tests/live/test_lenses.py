@@ -8,11 +8,9 @@ import pytest
 from skyquilt.live.live_map import LiveMap
 from skyquilt.live.members import FISHEYES
 from skyquilt.live.settings import LiveSettings
-from skyquilt.simulate import FlightSettings
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, Route
-from tests.live.conftest import Flight, made, offsets
-from tests.once import flown_once
+from tests.live.conftest import fed, made, offsets
 
 pytestmark = pytest.mark.slow
 
@@ -20,27 +18,18 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def wide(tmp_path_factory):
     """12 photos of 800 x 600 px and 118 degrees."""
-    settings = FlightSettings(
+    return made(
+        tmp_path_factory,
+        "live-fisheye",
         seed=641,
         lens=Lens(fisheye=True).scaled(800, 600).seeing(118.0),
         route=Route(photos=12, height=50.0),
         control=Control(points=0, checks=0),
     )
-    folder = flown_once(tmp_path_factory, "live-fisheye", settings)
-    return Flight(folder=folder, truth=json.loads((folder / "truth" / "truth.json").read_text()))
 
 
 def opened(folder):
     return LiveMap(folder, LiveSettings(deterministic=True))
-
-
-def fed(live, paths):
-    for path in paths:
-        live.add(path)
-    live.blocks.last_arrival = -1e9  # as if it had been quiet for long
-    for _ in live.drain_all():
-        pass
-    return live
 
 
 def test_photos_of_a_fisheye_are_adjusted_as_such(wide, tmp_path):
@@ -98,6 +87,8 @@ def test_a_pinhole_is_asked_now_and_then_and_stays_one(tmp_path_factory, tmp_pat
             {m.photo.camera_key for m in live.members.on_map()},
         )
         assert lenses._asked[camera] >= 4 and not live.members.fisheyes
-        assert not lenses.asks(camera)  # not before there are twice as many links
+        assert not lenses.asks(
+            live.members.by_id[1].photo
+        )  # not before there are twice as many links
     finally:
         live.close()

@@ -22,18 +22,12 @@ from skyquilt.quality.replay import correlation
 from skyquilt.raster.map_source import TileSource
 from skyquilt.raster.tile_store import SIDE
 from tests.end_to_end.conftest import relabel, taken_apart
-from tests.live.conftest import offsets
+from tests.live.conftest import fed, offsets
 from tests.photos.conftest import with_segment
 
 
 def mapped(folder, paths, **settings):
-    live = LiveMap(folder, LiveSettings(**settings))
-    for path in paths:
-        live.add(path)
-    live.blocks.last_arrival = -1e9  # as if it had been quiet for long
-    for _ in live.drain_all():
-        pass
-    return live
+    return fed(LiveMap(folder, LiveSettings(**settings)), paths)
 
 
 @pytest.mark.slow

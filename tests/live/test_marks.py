@@ -11,7 +11,7 @@ from skyquilt.live.live_map import LiveMap
 from skyquilt.live.marks import LOOKED
 from skyquilt.live.settings import LiveSettings
 from skyquilt.simulate.settings import Control, Route
-from tests.live.conftest import made, offsets
+from tests.live.conftest import fed, made, offsets
 
 pytestmark = pytest.mark.slow
 LINES = ((8, 350), (8, 58), (8, 86))
@@ -44,23 +44,14 @@ def opened(folder, **settings):
     return LiveMap(folder, LiveSettings(**settings))
 
 
-def mapped(live, paths):
-    for path in paths:
-        live.add(path)
-    live.blocks.last_arrival = -1e9  # as if it had been quiet for long
-    for _ in live.drain_all():
-        pass
-    return live
-
-
 def rms(live, flight):
     return np.sqrt((offsets(live, flight)[:, :2] ** 2).mean(0)).max()
 
 
 def test_a_text_in_every_picture_moves_nothing(plain, stamped, tmp_path):
     """Without marks it moves photos by 16 m. Positions scatter by 2 m."""
-    one = mapped(opened(tmp_path / "plain"), plain.photos)
-    live = mapped(opened(tmp_path / "stamped"), stamped)
+    one = fed(opened(tmp_path / "plain"), plain.photos)
+    live = fed(opened(tmp_path / "stamped"), stamped)
     try:
         assert [m.state for m in live.members.by_id.values()] == ["refined"] * 14
         assert rms(live, plain) < 1.2 * rms(one, plain) < 1.5
@@ -73,11 +64,11 @@ def test_a_text_in_every_picture_moves_nothing(plain, stamped, tmp_path):
 
 
 def test_a_restart_goes_on_with_the_same_marks(stamped, tmp_path):
-    through = mapped(opened(tmp_path / "through", deterministic=True), stamped[:9])
-    begun = mapped(opened(tmp_path / "again", deterministic=True), stamped[:7])
+    through = fed(opened(tmp_path / "through", deterministic=True), stamped[:9])
+    begun = fed(opened(tmp_path / "again", deterministic=True), stamped[:7])
     looked = begun.ledger.meta(LOOKED)
     begun.close()
-    again = mapped(opened(tmp_path / "again", deterministic=True), stamped[7:9])
+    again = fed(opened(tmp_path / "again", deterministic=True), stamped[7:9])
     try:
         assert list(looked.values()) == [6]
         for a, b in zip(through.members.on_map(), again.members.on_map(), strict=True):
@@ -92,7 +83,7 @@ def test_a_restart_goes_on_with_the_same_marks(stamped, tmp_path):
 
 @pytest.mark.parametrize("said", ["text", [1], {"camera": "many"}, {"camera": -3}])
 def test_a_damaged_list_of_looks_counts_as_none(stamped, tmp_path, said):
-    live = mapped(opened(tmp_path / "out"), stamped[:2])
+    live = fed(opened(tmp_path / "out"), stamped[:2])
     try:
         live.ledger.put_meta(LOOKED, said)
         assert live.live_links.marks._told("camera") == 0
@@ -106,7 +97,7 @@ def _events(live):
 
 
 def test_blocks_are_divided_where_a_link_alone_held_them_together(plain, tmp_path):
-    live = mapped(opened(tmp_path / "out"), plain.photos[:5])
+    live = fed(opened(tmp_path / "out"), plain.photos[:5])
     members = live.members
     try:
         for i in range(1, 6):

@@ -12,7 +12,7 @@ from skyquilt.alignment.problem import PART, READOUT, Problem, State
 from skyquilt.alignment.start import Start
 from skyquilt.alignment.tracks import Tracks
 from skyquilt.alignment.triangulate import intersect
-from skyquilt.geometry.camera import FURTHEST
+from skyquilt.geometry.camera import tangent_over_angle
 from skyquilt.geometry.frames import angle_difference_deg, cam_R_map_from_angles
 from skyquilt.model.camera import PARAMETERS, Camera, order_named
 from skyquilt.model.photo import Photo
@@ -166,8 +166,7 @@ class Setup:
         K = self.base.K0[self.camera[row]]
         p = ((tracks.px[:, 0] - K[:, 1]) - 1j * (tracks.px[:, 1] - K[:, 2])) / K[:, 0]
         if (fisheye := K[:, FISHEYE] > 0).any():
-            angle = np.abs(p[fisheye])
-            p[fisheye] *= np.tan(np.minimum(angle, FURTHEST)) / np.maximum(angle, 1e-9)
+            p[fisheye] *= tangent_over_angle(np.abs(p[fisheye]))
         return np.asarray(p)
 
 

@@ -79,6 +79,14 @@ def angle_over_tangent(r2: Array) -> Array:
     return np.where(small, series, np.arctan(r) / np.where(small, 1.0, r))
 
 
+def tangent_over_angle(angle: Array) -> Array:
+    """The tangent of angles (...) from the axis in rad over the angle; angles beyond `FURTHEST`
+    have its tangent.
+    """
+    tangent = np.tan(np.minimum(angle, FURTHEST))
+    return np.where(angle > 1e-9, tangent / np.maximum(angle, 1e-9), 1.0)
+
+
 def project(camera: Camera, xyz_cam: Array) -> Array:
     """Pixels (N, 2) of points (N, 3) in camera coordinates; NaN behind the camera."""
     z = xyz_cam[..., 2:3]
@@ -152,9 +160,7 @@ def undistort(camera: Camera, px: Array, *, iterations: int = 20) -> Array:
     if k[3:8].any():
         flat = _undistorted(flat, _begun(camera, flat), k, iterations)
     if k[9]:
-        angle = np.linalg.norm(flat, axis=1)
-        tangent = np.tan(np.minimum(angle, FURTHEST))
-        flat = flat * np.where(angle > 1e-9, tangent / np.maximum(angle, 1e-9), 1.0)[:, None]
+        flat = flat * tangent_over_angle(np.linalg.norm(flat, axis=1))[:, None]
     return np.asarray(flat.reshape(target.shape))
 
 

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from skyquilt.live.members import Members
 from skyquilt.matching.lens_kind import fisheyes, may_be_fisheye
 from skyquilt.model.features import Features, Link
+from skyquilt.model.photo import Photo
 
 FEWEST, MOST = 4, 64
 """Links of a camera from which, and up to which, it is asked whenever there are twice as many."""
@@ -23,14 +24,14 @@ class LiveLenses:
         self.members, self.features = members, features
         self._asked = dict[str, int]()
 
-    def asks(self, camera: str) -> bool:
-        """Whether it is time to ask for the kind of a camera's lens (`camera_key`)."""
-        own = [m for m in self.members.by_id.values() if m.photo.camera_key == camera]
-        photo = own[0].photo
-        if photo.band != "visible" or not may_be_fisheye(photo.lens):
+    def asks(self, photo: Photo) -> bool:
+        """Whether it is time to ask for the kind of the lens of a photo's camera."""
+        camera, asked = photo.camera_key, self._asked.get(photo.camera_key, 0)
+        if asked > MOST or photo.band != "visible" or not may_be_fisheye(photo.lens):
             return False
-        count, asked = sum(len(m.links) for m in own) // 2, self._asked.get(camera, 0)
-        if count < max(FEWEST, 2 * asked) or asked > MOST:
+        own = (m for m in self.members.by_id.values() if m.photo.camera_key == camera)
+        count = sum(len(m.links) for m in own) // 2
+        if count < max(FEWEST, 2 * asked):
             return False
         self._asked[camera] = count
         return True

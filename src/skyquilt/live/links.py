@@ -74,7 +74,7 @@ class LiveLinks:
         """
         camera = member.photo.camera_key
         marked = self.marks.look(camera)
-        bent = self.lenses.asks(camera) and self.lenses.bent(camera, self._of(camera))
+        bent = self.lenses.asks(member.photo) and self.lenses.bent(camera, self._of(camera))
         if marked or bent:
             self._compare_again(camera, marked=marked, bent=bent)
         found: dict[tuple[int, int], Link | None] = {}

@@ -339,10 +339,12 @@ def _perspective(
     return _camera(size, mm * px_per_mm, centre, distortion if len(distortion) == 5 else None)
 
 
-def _principal_point(xmp: Xmp, px_per_mm: float, size: tuple[int, int]) -> tuple[float, float]:
-    """In px from the image's corner; the middle where none is given."""
+def _principal_point(
+    xmp: Xmp, px_per_mm: float | None, size: tuple[int, int]
+) -> tuple[float, float]:
+    """In px from the image's corner; the middle where none is given, or nothing tells its unit."""
     point = xmp.numbers("Camera:PrincipalPoint")
-    if len(point) != 2:
+    if px_per_mm is None or len(point) != 2:
         return size[0] / 2, size[1] / 2
     return point[0] * px_per_mm, point[1] * px_per_mm
 
@@ -359,9 +361,7 @@ def _fisheye(
         return None
     if len(matrix) != 4 or not (matrix[0] > 0 and matrix[3] > 0 and all(map(math.isfinite, rho))):
         return f"an affine matrix of {plain(written, 60)}"
-    px_per_mm = _px_per_mm(exif, sensor, size)
-    middle = (size[0] / 2, size[1] / 2)
-    centre = middle if px_per_mm is None else _principal_point(xmp, px_per_mm, size)
+    centre = _principal_point(xmp, _px_per_mm(exif, sensor, size), size)
     first, *higher = angular_of_pix4d(rho or (0.0, 1.0), math.hypot(*size) / 2 / matrix[0])
     if not first > 0:
         return f"a polynomial of {', '.join(f'{n:.4g}' for n in rho)}"
@@ -373,7 +373,7 @@ def _fisheye(
 
 def _px_per_mm(exif: Exif, sensor: Sensor | None, size: tuple[int, int]) -> float | None:
     resolution = exif.number(tag.PLANE_X)
-    mm = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}.get(int(exif.number(tag.PLANE_UNIT) or 2))
+    mm = _MM_PER_UNIT.get(int(exif.number(tag.PLANE_UNIT) or 2))
     if resolution and mm:
         return resolution / mm
     return max(size) / sensor.width_mm if sensor else None
