@@ -169,3 +169,51 @@ def test_large_pictures_are_sharpened_at_a_finer_resolution(auto):
     coarse = replace(auto, decide=replace(auto.decide, finest=1e9))(*pictures)
     fine = auto(*pictures)
     assert error(fine.b_H_a, truth, shape) < 0.15 < error(coarse.b_H_a, truth, shape) < 1.5
+
+
+def trees(seed, jitter):
+    """(760, 860) brightness of trees in rows 34 px apart, 38 px along them, each up to `jitter` px
+    (standard deviation) off its place; `seed` None leaves the ground bare.
+    """
+    rng = np.random.default_rng(seed)
+    field = np.zeros((760, 860), np.float32)
+    for y in range(15, 760, 34):
+        for x in range(15, 860, 38):
+            at = np.rint(np.array([x, y]) + rng.normal(0, jitter, 2)).astype(int)
+            cv2.circle(field, (int(at[0]), int(at[1])), 9, 90.0, -1)
+    return cv2.GaussianBlur(field, (0, 0), 1.0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_repeats_is_refused_and_found_where_trees_stand_off_their_rows(auto, seed):
+    """Two parts of a field: nothing tells the periods apart, so neither picture may be moved."""
+    rng = np.random.default_rng(seed)
+    noise = [rng.normal(0, 6, (480, 560)).astype(np.float32) for _ in range(2)]
+    right, down = (int(n) for n in rng.integers(20, 90, 2))
+    outcome = {}
+    for jitter in (0.0, 3.0):
+        field = trees(seed, jitter)
+        a = np.clip(100 + field[100:580, 100:660] + noise[0], 0, 255).astype(np.uint8)
+        moved = field[100 + down : 580 + down, 100 + right : 660 + right]
+        b = np.clip(200 - 0.8 * moved + noise[1], 0, 255).astype(np.uint8)
+        outcome[jitter] = auto(Picture(values=a), Picture(values=b))
+    assert isinstance(outcome[0.0], RefusedRegistration)
+    assert "the pictures repeat" in outcome[0.0].reason
+    truth = np.array([[1, 0, -right], [0, 1, -down], [0, 0, 1.0]])
+    assert outcome[3.0], outcome[3.0].reason
+    assert error(outcome[3.0].b_H_a, truth) < 1
+
+
+@pytest.mark.parametrize("degrees", [0.0, 25.0])
+def test_rows_of_crops_tell_no_place_along_them(auto, degrees):
+    y, x = np.mgrid[:480, :640]
+    across = x * np.cos(np.radians(degrees)) + y * np.sin(np.radians(degrees))
+    rng = np.random.default_rng(4)
+    a, b = (
+        np.clip(
+            128 + 60 * np.sin(2 * np.pi * (across + s) / 22) + rng.normal(0, 15, x.shape), 0, 255
+        )
+        for s in (0, 7)
+    )
+    outcome = auto(Picture(values=a.astype(np.uint8)), Picture(values=255 - b.astype(np.uint8)))
+    assert isinstance(outcome, RefusedRegistration)

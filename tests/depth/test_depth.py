@@ -1,6 +1,7 @@
 """Depth maps of a simulated flight against the heights it was flown over."""
 
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -10,7 +11,7 @@ from rasterio.warp import Resampling, reproject
 
 from skyquilt.depth.workflow import depth, iter_depth
 from skyquilt.errors import OutputError, RefusedError, UsageError
-from skyquilt.model.event import Note
+from skyquilt.model.event import Note, StageStarted
 from skyquilt.settings import MosaicSettings
 from skyquilt.simulate import FlightSettings, simulate
 from skyquilt.simulate.camera import Lens
@@ -162,6 +163,42 @@ def test_two_photos_show_their_heights_and_their_field(flight, tmp_path):
     depth(others, tmp_path / "out", SETTINGS, overwrite=True)
     (left,) = (tmp_path / "out" / "pairs").iterdir()
     assert left.name != pair["field"]  # nothing of the former run stays
+
+
+@pytest.mark.slow
+def test_a_photo_that_is_lost_meanwhile_is_left_out(flight, tmp_path):
+    """The heights are those of the others alone."""
+    for name in ("whole", "others"):
+        shutil.copytree(flight / "photos", tmp_path / name)
+    gone = sorted((tmp_path / "whole").glob("*.jpg"))[4]
+    (tmp_path / "others" / gone.name).unlink()
+    notes = []
+    for event in iter_depth(tmp_path / "whole", tmp_path / "out", SETTINGS):
+        if isinstance(event, StageStarted) and event.stage == "features":
+            gone.unlink(missing_ok=True)
+        notes += [event.text] if isinstance(event, Note) else []
+    assert f"{gone.name} is left out: its file is gone" in notes
+    depth(tmp_path / "others", tmp_path / "fewer", SETTINGS)
+    with (
+        rasterio.open(tmp_path / "out" / "depth.tif") as found,
+        rasterio.open(tmp_path / "fewer" / "depth.tif") as alone,
+    ):
+        assert np.array_equal(found.read(1), alone.read(1), equal_nan=True)
+
+
+@pytest.mark.slow
+def test_of_two_photos_none_may_be_lost(flight, tmp_path):
+    for path in sorted((flight / "photos").glob("*.jpg"))[:2]:
+        shutil.copy(path, tmp_path / path.name)
+    a, b = sorted(tmp_path.glob("*.jpg"))
+    events = iter_depth([a, b], tmp_path / "out", SETTINGS)
+    notes = []
+    with pytest.raises(UsageError, match="at least two photos"):
+        for event in events:
+            if isinstance(event, StageStarted) and event.stage == "features":
+                b.unlink()
+            notes += [event.text] if isinstance(event, Note) else []
+    assert any(b.name in note and "is gone" in note for note in notes)
 
 
 def test_what_tells_no_height_is_refused(flight, tmp_path):

@@ -10,6 +10,7 @@ from skyquilt.model.photo import Photo
 from skyquilt.photos.flir import FlirCamera
 from skyquilt.photos.pixels import read_color, read_gray
 from skyquilt.photos.read import read_photo
+from skyquilt.photos.survey import read_survey
 from skyquilt.photos.thermal import thermal_frame_of_values
 
 from .conftest import jpeg_bytes, pixels, with_segment
@@ -250,6 +251,16 @@ def test_sixteen_bits_without_a_word_are_a_picture_until_somebody_says_what_they
     }
     assert any("no unit is stated" in n for n in found["auto"].notes)
     assert float(read_color(found["counts"])[0, 0]) == 29515
+
+
+def test_a_note_says_what_to_give_if_sixteen_bits_are_temperatures(tmp_path):
+    for k in range(3):
+        tifffile.imwrite(tmp_path / f"t{k}.tif", np.full((60, 80), 29515 + k, np.uint16))
+    told = read_survey(tmp_path).notes
+    assert any("3 photos have one band of 16 bits" in n and "--thermal-unit" in n for n in told)
+    (tmp_path / "rgb").mkdir()
+    tifffile.imwrite(tmp_path / "rgb" / "t.tif", np.full((60, 80, 3), 29515, np.uint16))
+    assert not any("16 bits" in n for n in read_survey(tmp_path / "rgb").notes)
 
 
 def test_frames_of_one_survey_are_read_alike(tmp_path):

@@ -14,8 +14,11 @@ from skyquilt.errors import RefusedError
 from skyquilt.geometry.camera import project, rays
 from skyquilt.geometry.frames import angle_deg, cam_R_map_from_angles
 from skyquilt.model.camera import Camera
-from skyquilt.model.event import Result
+from skyquilt.model.event import Note, Result
+from skyquilt.ortho.exposure import NEUTRAL
 from skyquilt.settings import MosaicSettings
+from skyquilt.thermal import workflow
+from skyquilt.thermal.by_rig import draw_rigged
 from skyquilt.thermal.workflow import iter_thermal
 
 HEAT = Camera.ideal(width=320, height=256, focal=400.0)
@@ -111,3 +114,25 @@ def test_a_damaged_frame_is_left_out(flight, frames, output, tmp_path):
     told = last.metrics["thermal"]
     assert told["route"] == "rig" and told["photos_used"] == 8
     assert list(told["photos_rejected"]) == [bad.name]
+
+
+@pytest.mark.slow
+def test_a_frame_that_is_lost_before_it_is_drawn_is_left_out(
+    flight, frames, output, tmp_path, monkeypatch
+):
+    shutil.copytree(frames, tmp_path / "heat")
+    gone = sorted((tmp_path / "heat").glob("*.tif"))[2]
+
+    def drawn(*arguments):
+        gone.unlink(missing_ok=True)
+        draw_rigged(*arguments)
+
+    monkeypatch.setattr(workflow, "draw_rigged", drawn)
+    monkeypatch.setattr(workflow, "drift_of_rigged", lambda *_: NEUTRAL)
+    *before, last = iter_thermal(flight / "photos", tmp_path / "heat", output, SETTINGS)
+    told = last.metrics["thermal"]
+    assert told["route"] == "rig" and told["photos_used"] == 8
+    assert told["photos_rejected"] == {gone.name: "its file is gone"}
+    assert f"{gone.name} is left out: its file is gone" in [
+        event.text for event in before if isinstance(event, Note)
+    ]

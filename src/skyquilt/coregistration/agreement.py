@@ -121,7 +121,7 @@ class Agree:
                 if both[part].mean() < self.filled:
                     continue
                 around = padded[top : top + side + 2 * reach, left : left + side + 2 * reach]
-                score = _scores(around, target[part] * both[part][..., None])
+                score = scores(around, target[part] * both[part][..., None])
                 x, y = _summit(score)
                 yield (
                     self._rank(score),
@@ -143,7 +143,7 @@ class Agree:
         return float((1 + (rivals >= own).sum()) / (1 + rivals.size))
 
 
-def _scores(around: Fields, patch: Fields) -> NDArray[np.float32]:
+def scores(around: Fields, patch: Fields) -> NDArray[np.float32]:
     """Normalised correlation of a patch (s, s, 4) at every position in its surroundings."""
     side = patch.shape[0]
     energy = cv2.boxFilter(

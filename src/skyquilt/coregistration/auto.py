@@ -72,7 +72,8 @@ class Auto:
             return pictures
         pyramid = Pyramid(a=pictures[0], b=pictures[1], sides=self.sides)
         fits = self._best(pyramid, self._near(pyramid, part.guess))
-        return part.whole(self.decide(pyramid, fits))
+        reach = part.guess.reach * max(pyramid.at(_DECIDE)[1].shape)
+        return part.whole(self.decide(pyramid, fits, reach))
 
     def _near(self, pyramid: Pyramid, guess: Guess) -> list[Matrix]:
         """Candidate transforms near a guess, in px of the selection level."""

@@ -20,6 +20,7 @@ from skyquilt.coregistration.orientation import (
     warped,
 )
 from skyquilt.coregistration.refine_registration import grid
+from skyquilt.coregistration.repeats import Repeats, Rival
 from skyquilt.coregistration.subpixel import Fit, Freedom, SubpixelRefinement
 from skyquilt.geometry.transforms import fit as fitted
 from skyquilt.geometry.transforms import transfer
@@ -40,6 +41,8 @@ class Decide:
     """Agreement below which a registration is refused; docs/methods.md gives the values that occur
     by chance.
     """
+    repeats: Repeats = field(default_factory=Repeats)
+    """The comparison with places further away."""
     gain: float = 0.02
     """Relative gain in correlation required for a homography instead of a similarity."""
     determined: float = 3.0
@@ -58,10 +61,14 @@ class Decide:
     """Weight of finer structure, the rest is that of coarser one. Alone it is the more exact where
     the bands are alike, and the less exact where they are not, and its error is less certain.
     """
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 5
 
-    def __call__(self, pyramid: Pyramid, fits: Sequence[Fit]) -> Outcome:
-        """The decision on transforms in px of the finest level."""
+    def __call__(
+        self, pyramid: Pyramid, fits: Sequence[Fit], reach: float = float("inf")
+    ) -> Outcome:
+        """The decision on transforms in px of the finest level; `reach`: how far in px of it the
+        registration may lie from them, by what is known beforehand.
+        """
         judged = [(self.agree(*pyramid.at(pyramid.last), fit.b_H_a), fit) for fit in fits]
         if not judged:
             return RefusedRegistration(
@@ -71,6 +78,13 @@ class Decide:
         if agreement.surprise < self.least_surprise:
             return RefusedRegistration(
                 reason=_doubt(agreement, self.least_surprise),
+                inliers=len(agreement.px),
+                evidence=_evidence(agreement, fit),
+            )
+        rival = self.repeats(*pyramid.at(pyramid.last), fit.b_H_a, self.agree)
+        if rival is not None and np.hypot(*rival.shift) <= reach:
+            return RefusedRegistration(
+                reason=_repeated(rival, pyramid),
                 inliers=len(agreement.px),
                 evidence=_evidence(agreement, fit),
             )
@@ -156,6 +170,15 @@ def _doubt(agreement: Agreement, least: float) -> str:
         f"the best position found is not confirmed: {len(agreement.px)} of {agreement.patches}"
         " patches agree with"
         f" it, significance 10^-{agreement.surprise:.1f}; 10^-{least:g} is required"
+    )
+
+
+def _repeated(rival: Rival, pyramid: Pyramid) -> str:
+    scale = float(pyramid.at(pyramid.last)[1].small_S_full[0, 0])
+    x, y = (round(s / scale) for s in rival.shift)
+    return (
+        f"the pictures repeat: moved by ({x}, {y}) px of B they fit as well, and nothing tells"
+        " which place is right"
     )
 
 

@@ -39,7 +39,7 @@ from skyquilt.engine.clock import Clock, Steps
 from skyquilt.engine.folder import STATE, claimed
 from skyquilt.engine.store import Store
 from skyquilt.engine.workers import Threads
-from skyquilt.errors import RefusedError, UsageError
+from skyquilt.errors import PhotoFailedError, RefusedError, UsageError
 from skyquilt.model.event import Event, Note, Result
 from skyquilt.model.surface import Surface
 from skyquilt.raster.atomic import write_text
@@ -112,13 +112,13 @@ def iter_depth(
         )
         yield from (Note(text=n) for n in given.survey.notes)
         given = yield from frames_added(given, settings, clock)
-        survey = given.survey
         _enough(given)
+        total = len(given.survey.photos)
         if route == "auto":
-            route = "pair" if len(survey.photos) == 2 else "reconstruction"
-        scene, depth = yield from _by_route(route, given, settings, relief_m, clock)
+            route = "pair" if total == 2 else "reconstruction"
+        scene, depth, given = yield from _without_bad(route, given, settings, relief_m, clock)
         record = yield from clock.stage("draw", _drawn(output, route, scene, depth))
-        record |= {"cpu_seconds": round(clock.cpu_total(), 2), "photos_total": len(survey.photos)}
+        record |= {"cpu_seconds": round(clock.cpu_total(), 2), "photos_total": total}
         write_text(output / "depth.json", json.dumps(record, indent=1, allow_nan=False) + "\n")
         yield Result(output=output, metrics=record)
 
@@ -148,6 +148,24 @@ def depth(
         if isinstance(happened, Result):
             return happened
     raise RuntimeError("the workflow ended without a result")
+
+
+def _without_bad(
+    route: str, given: SurveyInput, settings: MosaicSettings, relief_m: float | None, clock: Clock
+) -> Generator[Event, None, tuple[Scene, Depth, SurveyInput]]:
+    """The heights, and the survey that they are of: a photo that cannot be used any more is left
+    out, and the steps are repeated without it.
+    """
+    total = len(given.survey.photos)
+    while True:
+        try:
+            return *(yield from _by_route(route, given, settings, relief_m, clock)), given
+        except PhotoFailedError as error:
+            failed = given.failing(error, total)
+        for photo in failed:
+            yield Note(text=f"{photo.name} is left out: {photo.reason}", warning=True)
+        given = given.without(failed)
+        _enough(given)
 
 
 def _by_route(

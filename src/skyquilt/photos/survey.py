@@ -313,6 +313,19 @@ def _thermal_units(photos: Sequence[Photo]) -> Iterator[str]:
         )
     elif units:
         yield f"Thermal TIFFs are read as {listed.split(' as ')[1]} ({sum(units.values())})."
+    untold = [
+        p
+        for p in photos
+        if p.dtype == "uint16"
+        and p.channels == 1
+        and not p.unit
+        and p.camera_key.startswith("unknown camera")
+    ]
+    if untold:
+        yield (
+            f"{len(untold)} photos have one band of 16 bits and state neither unit nor maker: they"
+            " are mapped as brightness; if they are temperatures, give --thermal-unit."
+        )
 
 
 def _gaps(photos: Sequence[Photo]) -> Iterator[str]:

@@ -1,7 +1,7 @@
 """Thermal photos placed by the poses and the surface of visual photos taken by the same drone."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -51,9 +51,24 @@ class Rigged:
     photos: tuple[Photo, ...]
     """Thermal photos taken at the same time as a placed visual one."""
     alignment: Alignment
-    """Their poses in the visual map's frame."""
+    """Poses of those that can be drawn in the visual map's frame."""
     rejected: tuple[RejectedPhoto, ...] = ()
     """Thermal photos that were taken together with a visual one, but cannot be decoded."""
+
+    def without(self, error: PhotoFailedError) -> "Rigged":
+        """The others, without the photo on which drawing failed."""
+        poses = {k: p for k, p in self.alignment.poses.items() if self._name(k) != error.photo}
+        alignment = replace(
+            self.alignment,
+            poses=poses,
+            camera_of=dict.fromkeys(poses, "thermal"),
+            blocks=(tuple(poses),),
+        )
+        bad = RejectedPhoto(name=error.photo, reason=error.reason)
+        return replace(self, alignment=alignment, rejected=(*self.rejected, bad))
+
+    def _name(self, index: int) -> str:
+        return self.photos[index].name
 
 
 def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistration:
@@ -118,7 +133,7 @@ def _pixels(photo: Photo) -> NDArray[Any]:
         return read_color(photo)
     except Exception as error:
         reason = lost(photo) or rejected(photo.name, error).reason
-        raise PhotoFailedError(photo.name, f"{reason}; run the same command again") from error
+        raise PhotoFailedError(photo.name, reason) from error
 
 
 def _freedom(photo: Photo) -> float:
@@ -223,7 +238,7 @@ def rig_figures(found: Rigged, thermal: Survey) -> dict[str, Any]:
             "focal_px": round(rig.camera_b.focal, 2),
         },
         "thermal_R_visual": rig.b_R_a.tolist(),
-        "photos_used": len(found.photos),
+        "photos_used": len(found.alignment.poses),
         "photos_total": len(thermal.photos) + len(thermal.rejected),
         "photos_rejected": {p.name: p.reason for p in (*thermal.rejected, *found.rejected)},
     }

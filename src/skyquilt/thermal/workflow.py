@@ -12,7 +12,7 @@ heights, which are the same in every spectral band, by day and night, in summer 
 no registration is accepted, the thermal map is placed by its own positions, and this is reported.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -23,9 +23,10 @@ from numpy.typing import NDArray
 
 from skyquilt.coregistration.files import overlays, resample_onto
 from skyquilt.coregistration.pictures import Source
+from skyquilt.coregistration.rig import FindRig
 from skyquilt.coregistration.workflow import residual
 from skyquilt.engine.clock import Clock
-from skyquilt.errors import RefusedError, UsageError
+from skyquilt.errors import PhotoFailedError, RefusedError, UsageError
 from skyquilt.model.event import Event, Note, Result, StageFinished, StageStarted
 from skyquilt.model.photo import Survey
 from skyquilt.model.registration import RefusedRegistration, Registration
@@ -87,7 +88,7 @@ def iter_thermal(
     if route in ("auto", "rig"):
         began = Clock.now()
         yield StageStarted(stage="rig", total=0)
-        result = _by_rig(visual, heats.survey, asked.picture)
+        result = yield from _by_rig(visual, heats.survey, asked.picture)
         yield _finished("rig", began)
         if isinstance(result, Result):
             yield result
@@ -184,9 +185,9 @@ def _finished(stage: str, began: tuple[float, float]) -> StageFinished:
 
 def _by_rig(
     visual: FinishedMap, thermal: Survey, picture: PictureSettings
-) -> Result | RefusedRegistration:
+) -> Generator[Event, None, Result | RefusedRegistration]:
     """thermal.tif from the visual poses if one drone took both, or the reason why this is not
-    possible.
+    possible. Frames that are lost meanwhile are left out.
     """
     if not taken_together(visual.given.survey.photos, thermal.photos):
         return RefusedRegistration(
@@ -197,8 +198,19 @@ def _by_rig(
     if isinstance(found, RefusedRegistration):
         return found
     output, metrics = visual.result.output, visual.result.metrics
-    exposure = drift_of_rigged(found, scene, visual.methods.drift, picture)
-    draw_rigged(output / "thermal.tif", found, scene, visual.methods.blend, exposure)
+    while True:
+        try:
+            exposure = drift_of_rigged(found, scene, visual.methods.drift, picture)
+            draw_rigged(output / "thermal.tif", found, scene, visual.methods.blend, exposure)
+            break
+        except PhotoFailedError as error:
+            found = found.without(error)
+            yield Note(text=f"{error.photo} is left out: {error.reason}", warning=True)
+        if len(found.alignment.poses) < FindRig.minimum:
+            return RefusedRegistration(
+                reason=f"{len(found.alignment.poses)} thermal photos are left that were taken"
+                " together with a visual one"
+            )
     none = np.zeros((0, 2))
     same = Registration(model="identity", b_H_a=np.eye(3), px_a=none, px_b=none)
     figures = {"thermal": rig_figures(found, thermal)}

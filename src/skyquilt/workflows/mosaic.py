@@ -24,7 +24,7 @@ from skyquilt.engine.folder import STATE, RunFolder, open_run
 from skyquilt.engine.free_memory import give_back, return_large_blocks
 from skyquilt.engine.store import Store, digest
 from skyquilt.engine.workers import Threads, Workers, workers_for
-from skyquilt.errors import PhotoFailedError, SkyquiltError
+from skyquilt.errors import PhotoFailedError
 from skyquilt.model.event import Event, Note, Result
 from skyquilt.model.photo import RejectedPhoto
 from skyquilt.ortho.ground import Ground
@@ -249,7 +249,7 @@ def _without_bad(
     does not count as finished.
 
     Raises:
-        SkyquiltError: more than half of the photos, so it is not the photos that are bad.
+        SkyquiltError: more than half of the photos cannot be used any more.
     """
     total, still, key = len(given.survey.photos), given, make.key
     while True:
@@ -258,20 +258,13 @@ def _without_bad(
             return metrics, given, key
         except PhotoFailedError as error:
             log_error(make.output, str(error), error)
-            gone = {p.name: reason for p in given.survey.photos if (reason := lost(p))}
-            failed = {error.photo: error.reason} | gone
-        left = len(given.survey.photos) - len(failed)
-        if 2 * left < total:
-            name, reason = next(iter(failed.items()))
-            raise SkyquiltError(
-                f"{total - left} of {total} photos cannot be used any more, first {name}: {reason};"
-                " check their disk and run the same command again to resume"
-            )
-        for name, reason in failed.items():
-            yield Note(text=f"{name} is left out: {reason}", warning=True)
-        given = given.without([RejectedPhoto(name=n, reason=r) for n, r in failed.items()])
+            failed = given.failing(error, total)
+        for photo in failed:
+            yield Note(text=f"{photo.name} is left out: {photo.reason}", warning=True)
+        gone = [p for p in given.survey.photos if lost(p)]
+        given = given.without(failed)
         if gone:
-            still = still.without([RejectedPhoto(name=n, reason=r) for n, r in gone.items()])
+            still = still.without([p for p in failed if p.name in {g.name for g in gone}])
             key = run_key(still, make.settings, make.methods)
 
 

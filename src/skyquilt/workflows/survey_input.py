@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from skyquilt.alignment.priors import choose_frame
-from skyquilt.errors import UsageError
+from skyquilt.errors import PhotoFailedError, SkyquiltError, UsageError
 from skyquilt.model.clip import ChosenFrames
 from skyquilt.model.photo import (
     ControlPoint,
@@ -18,6 +18,7 @@ from skyquilt.photos.distances import read_distances
 from skyquilt.photos.gcp import check_control, read_gcp_list
 from skyquilt.photos.left_out import of_one_band
 from skyquilt.photos.lever_arm import with_lever_arm
+from skyquilt.photos.pixels import lost
 from skyquilt.photos.read import ReadPhoto, read_photo
 from skyquilt.photos.sequence import sequence_of
 from skyquilt.photos.shutter import stated_shutter
@@ -50,9 +51,28 @@ class SurveyInput:
         """The name of the folder, or the number of files."""
         return str(self.source) if isinstance(self.source, Path) else f"{len(self.source)} files"
 
-    def without(self, lost: Sequence[RejectedPhoto]) -> "SurveyInput":
+    def failing(self, error: PhotoFailedError, total: int) -> tuple[RejectedPhoto, ...]:
+        """Photos that cannot be used any more: first the one on which a step failed, then those
+        whose files are no longer the ones that were read.
+
+        Raises:
+            SkyquiltError: they are more than half of `total`, the photos at the start, so it is not
+                the photos that are bad.
+        """
+        gone = {p.name: reason for p in self.survey.photos if (reason := lost(p))}
+        failed = {error.photo: error.reason} | gone
+        left = len(self.survey.photos) - len(failed)
+        if 2 * left < total:
+            name, reason = next(iter(failed.items()))
+            raise SkyquiltError(
+                f"{total - left} of {total} photos cannot be used any more, first {name}: {reason};"
+                " check their disk and run the same command again to resume"
+            )
+        return tuple(RejectedPhoto(name=n, reason=r) for n, r in failed.items())
+
+    def without(self, bad: Sequence[RejectedPhoto]) -> "SurveyInput":
         """The survey without some of its photos, which become rejected ones."""
-        names = {p.name for p in lost}
+        names = {p.name for p in bad}
 
         def kept(points: Sequence[PointObservation]) -> tuple[PointObservation, ...]:
             return tuple(o for o in points if o.photo not in names)
@@ -60,7 +80,7 @@ class SurveyInput:
         survey = replace(
             self.survey,
             photos=tuple(p for p in self.survey.photos if p.name not in names),
-            rejected=(*self.survey.rejected, *lost),
+            rejected=(*self.survey.rejected, *bad),
         )
         control = [replace(c, observations=kept(c.observations)) for c in self.control]
         distances = [
