@@ -1,6 +1,6 @@
 """The factor of a matrix of blocks against dense linear algebra."""
 
-from io import BytesIO
+import resource
 
 import numpy as np
 import pytest
@@ -130,29 +130,40 @@ def test_a_factor_in_a_file_is_the_one_in_memory(monkeypatch):
     assert np.array_equal(a.blocks, b.blocks) and np.array_equal(a.corner, b.corner)
 
 
-def test_a_factor_for_which_the_disk_is_too_full_stays_in_memory(monkeypatch):
-    class Full:
-        """A file that takes three writes."""
+@pytest.fixture
+def most_bytes():
+    """Sets how many bytes a file of this process may have, as a disk that fills up does."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield lambda n: resource.setrlimit(resource.RLIMIT_FSIZE, (n, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
-        def __init__(self, dir=None):
-            self.file, self.left = BytesIO(), 3
 
-        def writelines(self, parts):
-            self.left -= 1
-            if self.left < 0:
-                raise OSError(28, "No space left on device")
-            self.file.writelines(parts)
+@pytest.mark.parametrize("room", [0, 1, 0.3, 0.7, -1])
+def test_a_factor_for_which_the_disk_is_too_full_stays_in_memory(monkeypatch, most_bytes, room):
+    """`room`: bytes, or the share of the factor's; -1 = all but one byte."""
+    m = matrix(*grid(14, 14, 2))
+    rhs = np.ones(14 * 14 * 3 + 2)
+    held = Factor(m)
+    size = held._parts._starts[-1]
+    monkeypatch.setattr(block_cholesky, "HELD", 0)
+    most_bytes(size - 1 if room < 0 else int(room * size) if room < 1 else room)
+    factor = Factor(m)
+    assert factor._parts._file is None and len(factor._parts._held) == len(m.pattern.fronts) > 4
+    assert np.array_equal(factor.solve(rhs), held.solve(rhs))
+    most_bytes(size)
+    filed = Factor(m)
+    assert filed._parts._file is not None
+    assert np.array_equal(filed.solve(rhs), held.solve(rhs))
 
-        def __getattr__(self, name):
-            return getattr(self.file, name)
 
+def test_a_factor_without_a_folder_for_its_file_stays_in_memory(monkeypatch, tmp_path):
     m = matrix(*grid(14, 14, 2))
     rhs = np.ones(14 * 14 * 3 + 2)
     held = Factor(m).solve(rhs)
     monkeypatch.setattr(block_cholesky, "HELD", 0)
-    monkeypatch.setattr(block_cholesky, "TemporaryFile", Full)
+    monkeypatch.setattr(block_cholesky, "folder_on_disk", lambda: str(tmp_path / "none"))
     factor = Factor(m)
-    assert factor._parts._file is None and len(factor._parts._held) == len(m.pattern.fronts) > 4
+    assert factor._parts._file is None and len(factor._parts._held) == len(m.pattern.fronts)
     assert np.array_equal(factor.solve(rhs), held)
 
 

@@ -8,6 +8,7 @@ and n^2. Unknowns that are coupled with all others, the *border* (cameras), are 
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from io import BufferedRandom
 from tempfile import TemporaryFile
@@ -237,7 +238,7 @@ def _parents(below: list[int]) -> list[int]:
 
 class _Parts:
     """Of each front of a factor: L (e, e) of the eliminated rows, and M (c, e) below it, S = L M^T;
-    in a file beside the memory where they are large.
+    in a file beside the memory where they are large and there is a disk for them.
     """
 
     def __init__(self, fronts: Sequence[Front]) -> None:
@@ -248,8 +249,9 @@ class _Parts:
         self._file: BufferedRandom | None = None
         self._read = np.empty(0)
         if self._starts[-1] > HELD:
-            self._file = TemporaryFile(dir=folder_on_disk())  # noqa: SIM115 - closed with the factor
-            self._read = np.empty(max(sizes) // 8)
+            with suppress(OSError):  # no folder for it that may be written
+                self._file = TemporaryFile(dir=folder_on_disk())
+                self._read = np.empty(max(sizes) // 8)
         self._added = 0
 
     def add(self, L: Array, M: Array) -> None:
@@ -257,6 +259,7 @@ class _Parts:
         if self._file is not None:
             try:
                 self._file.writelines(np.ascontiguousarray(part).data for part in (L.T, M))
+                self._file.flush()
             except OSError:  # a full disk
                 self._held, self._file = [self._copied(k) for k in range(self._added)], None
         if self._file is None:
@@ -272,9 +275,11 @@ class _Parts:
         if self._file is None:
             return self._held[k]
         e, c = self._shapes[k]
-        self._file.seek(self._starts[k])
         both = self._read[: e * (e + c)]
-        self._file.readinto(both.data)
+        # not through the file's own buffer: what a full disk refused is in it still
+        with open(self._file.fileno(), "rb", closefd=False) as file:
+            file.seek(self._starts[k])
+            file.readinto(both.data)
         return both[: e * e].reshape(e, e).T, both[e * e :].reshape(c, e)
 
 
