@@ -13,6 +13,7 @@ import tifffile
 from PIL import Image
 
 from skyquilt.errors import UnreadablePhotoError
+from skyquilt.photos.read import read_photo
 from skyquilt.simulate import FlightSettings, simulate
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, Reporting, Route
@@ -172,6 +173,28 @@ def test_png_tiff_and_a_torn_clip_among_jpegs(mosaic, photos):
     assert told.metrics["photos_used"] == 9
     assert list(told.metrics["photos_rejected"]) == ["DJI_0001.MP4"]
     assert "cut off" in told.metrics["photos_rejected"]["DJI_0001.MP4"]
+
+
+@pytest.mark.slow
+def test_photos_of_five_bands_give_a_map_of_five(mosaic, photos):
+    """The last two bands of the photos are 3/4 of the first two, and so are the map's."""
+    rows = ["EPSG:4326"]
+    for path in named(photos):
+        at = read_photo(path).position
+        rows.append(f"{path.stem}.tif {at.longitude_deg} {at.latitude_deg}")
+        rgb = pixels_of(path).astype(np.uint16)
+        bands = np.dstack([rgb * 200, rgb[..., :2] * 150])
+        kind = {"photometric": "minisblack", "planarconfig": "contig"}
+        tifffile.imwrite(path.with_suffix(".tif"), bands, **kind)
+        path.unlink()
+    (photos / "geo.txt").write_text("\n".join(rows) + "\n")
+    told = mosaic(photos).made()
+    assert told.metrics["photos_used"] == 9
+    found = tifffile.imread(told.output / "mosaic.tif").astype(float)
+    assert found.shape[2] == 5
+    shown = found[..., :2].min(axis=2) > 1000
+    assert shown.mean() > 0.3
+    assert found[shown][:, 3:] == pytest.approx(0.75 * found[shown][:, :2], abs=1.5)
 
 
 def test_two_cameras_are_both_used(mosaic, photos, flight):

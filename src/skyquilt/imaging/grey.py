@@ -44,7 +44,11 @@ def _fitting(image: NDArray[Any], longest: int) -> tuple[int, int] | None:
 
 def averaged(image: NDArray[Any], size: tuple[int, int]) -> NDArray[Any]:
     """The image (h, w[, bands]) area-averaged to a smaller size (width, height)."""
-    return np.asarray(cv2.resize(_halved(image, size), size, interpolation=cv2.INTER_AREA))
+    image = _halved(image, size)
+    if image.ndim == 3 and image.shape[2] > 4:  # more than OpenCV takes
+        planes = [image[..., k].copy() for k in range(image.shape[2])]
+        return np.stack([averaged(p, size) for p in planes], axis=-1)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
 
 def _halved(image: NDArray[Any], size: tuple[int, int]) -> NDArray[Any]:
