@@ -118,6 +118,22 @@ def test_multiband_tiff(tmp_path, planar, dtype):
     assert read_gray(photo).shape == (64, 96)
 
 
+@pytest.mark.parametrize("compression", ["raw", "packbits", "tiff_lzw"])
+@pytest.mark.parametrize("white", [0, 1])
+def test_black_and_white_tiff_is_read_as_the_same_png_is(tmp_path, compression, white):
+    """Pillow wrote both; `white`: the bit that stands for it."""
+    picture = Image.fromarray(pixels(99, 61)[..., 0]).convert("1")
+    picture.save(tmp_path / "b.png")
+    picture.save(tmp_path / "b.tif", compression=compression, tiffinfo={262: white})
+    with tifffile.TiffFile(tmp_path / "b.tif") as file:
+        assert (file.asarray() == white).mean() == np.asarray(picture).mean()
+    photo, other = (read_photo(tmp_path / name) for name in ("b.tif", "b.png"))
+    assert (photo.width, photo.height, photo.channels, photo.dtype) == (99, 61, 1, "uint8")
+    assert set(np.unique(read_color(photo))) == {0, 255}
+    assert np.array_equal(read_color(photo), read_color(other))
+    assert np.array_equal(read_gray(photo, reduction=2), read_gray(other, reduction=2))
+
+
 def test_truncated_tiff(tmp_path):
     tifffile.imwrite(tmp_path / "m.tif", pixels(), photometric="rgb")
     data = (tmp_path / "m.tif").read_bytes()

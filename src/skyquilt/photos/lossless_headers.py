@@ -92,7 +92,7 @@ def _check_extent(page: tifffile.TiffPage, file: BinaryIO) -> None:
 
 
 def _stored_as(dtype: np.dtype[np.generic]) -> Dtype:
-    if dtype == np.uint8:
+    if dtype in (np.uint8, np.bool_):
         return "uint8"
     if dtype == np.uint16:
         return "uint16"

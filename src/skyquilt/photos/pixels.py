@@ -182,8 +182,8 @@ def _png(file: BinaryIO, photo: Photo) -> Pixels:
 
 
 def read_tiff(file: BinaryIO, size: tuple[int, int]) -> Pixels:
-    """The first page of a TIFF as (height, width, bands), signed and wide types as float32; `size`:
-    the width and height that were checked.
+    """The first page of a TIFF as (height, width, bands), signed and wide types as float32, black and
+    white as 0 and 255; `size`: the width and height that were checked.
     """
     import tifffile  # imported here because most photos are JPEGs
 
@@ -192,8 +192,11 @@ def read_tiff(file: BinaryIO, size: tuple[int, int]) -> Pixels:
         _same_size((int(page.imagewidth), int(page.imagelength)), size)
         pixels = np.asarray(page.asarray(maxworkers=1))
         planar = page.planarconfig == 2 and pixels.ndim == 3
+        white = int(page.photometric) != tifffile.PHOTOMETRIC.MINISWHITE
     if planar:
         pixels = np.moveaxis(pixels, 0, -1)
+    if pixels.dtype == np.bool_:  # one bit for each pixel; `white` is the one that stands for it
+        pixels = np.where(pixels == white, 255, 0).astype(np.uint8)
     if pixels.dtype not in (np.uint8, np.uint16):
         pixels = pixels.astype(np.float32)
     return np.ascontiguousarray(pixels if pixels.ndim == 3 else pixels[..., None])
