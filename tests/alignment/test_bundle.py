@@ -103,6 +103,11 @@ class Flown:
         return HALF_TURN @ self.truth.R[i] if i in self.turned else self.truth.R[i]
 
 
+def stretched(aspect):
+    """The blocks' lens on a sensor with pixels of this focal length along columns over rows."""
+    return np.r_[LENS[:8], aspect, LENS[9:]]
+
+
 def worst_turn_deg(flown, alignment):
     turn = [
         cv2.Rodrigues(p.cam_R_map @ flown.file_pose(i).T)[0] for i, p in alignment.poses.items()
@@ -515,3 +520,30 @@ def test_photos_that_show_nothing_are_told(blank, told):
     notes = blank_notes([found(0)] * blank + [found(300)] * (4 - blank))
     assert bool(notes) == told
     assert not told or notes[0].startswith(f"{blank} of 4 photos show next to nothing")
+
+
+@pytest.mark.parametrize(
+    ("aspect", "by"),
+    [(0.75, "goes the same way"), (0.95, "deviations from 1"), (1.03, "deviations from 1")]
+    + [(1.33, "goes the same way")],
+)
+def test_pictures_that_are_stretched_are_named(aspect, by):
+    (note,) = [n for n in Flown(lens=stretched(aspect)).aligned().notes if "stretched" in n]
+    assert note.startswith("The photos of cam seem to be stretched") and by in note
+    if "deviations" in by:
+        found = float(note.split("of the ratio ")[1].split(",")[0])
+        assert found == pytest.approx(aspect, abs=0.01)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_ordinary_pictures_are_not_called_stretched(seed):
+    assert not any("stretched" in n for n in Flown(seed).aligned().notes)
+
+
+def test_a_stretched_picture_that_its_calibration_tells_is_not_named():
+    flown = Flown(lens=stretched(0.75))
+    told = Camera(width=WIDTH, height=HEIGHT, focal=LENS[0], cx=LENS[1], cy=LENS[2], aspect=0.75)
+    flown.photos = [replace(p, calibration=told) for p in flown.photos]
+    found = flown.aligned()
+    assert found.cameras["cam"].aspect == pytest.approx(0.75, abs=0.002)
+    assert not any("stretched" in n for n in found.notes)

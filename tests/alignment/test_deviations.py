@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from skyquilt.alignment.adjust import covariance
-from skyquilt.alignment.deviations import HIDDEN, MATCHED, observed_noise
+from skyquilt.alignment.deviations import HIDDEN, MATCHED, likeness, observed_noise
 from skyquilt.alignment.stages import weighed
 from tests.alignment.blocks import HEIGHT, WIDTH, make_block
 
@@ -16,18 +16,28 @@ def noise_of(shared, *, sigma=0.2, seed=0):
     """The noise found where neighbours in cells of an eighth of a photo share this part of the
     variance of their errors, at the true state; and the observations in a quarter of a photo.
     """
-    block = make_block(seed, points=2500, noise=0.0, lens_errs=False)
+    problem, state, size = observed_with(shared, sigma=sigma, seed=seed)
+    cell = (problem.px + 0.5) / (WIDTH, HEIGHT)
+    quarter = (2 * cell).astype(int)
+    crowd = np.bincount(4 * problem.photo + 2 * quarter[:, 1] + quarter[:, 0]).astype(float)
+    return observed_noise(problem, state, size), (crowd**2).sum() / crowd.sum()
+
+
+def observed_with(shared, *, sigma=0.2, seed=0, cameras=1):
+    """Observations of which neighbours in cells of an eighth of a photo share this part of the
+    variance of their errors (a number, or one for each camera), the truth, and the photos' sizes.
+    """
+    block = make_block(seed, points=2500, noise=0.0, lens_errs=False, cameras=cameras)
     problem, rng = block.problem, np.random.default_rng(seed)
     cell = (problem.px + 0.5) / (WIDTH, HEIGHT)
     column, row = (8 * cell).astype(int).T
     common = rng.normal(0, 1, (len(block.truth.C), 8, 8, 2))[problem.photo, row, column]
     own = rng.normal(0, 1, problem.px.shape)
+    shared = np.broadcast_to(shared, cameras)[problem.camera[problem.photo], None]
     px = problem.px + sigma * (np.sqrt(shared) * common + np.sqrt(1 - shared) * own)
     problem = replace(problem, px=px, sigma_px=np.full(len(px), sigma))
     size = np.tile([WIDTH, HEIGHT], (len(block.truth.C), 1)).astype(float)
-    quarter = (2 * cell).astype(int)
-    crowd = np.bincount(4 * problem.photo + 2 * quarter[:, 1] + quarter[:, 0]).astype(float)
-    return observed_noise(problem, block.truth, size), (crowd**2).sum() / crowd.sum()
+    return problem, block.truth, size
 
 
 @pytest.mark.parametrize("shared", [0.0, 0.1, 0.3])
@@ -35,6 +45,11 @@ def test_the_design_effect_is_kish_s(shared):
     found, together = noise_of(shared)
     assert together > 80
     assert (found.design_effect - 1) / (together - 1) == pytest.approx(shared, abs=0.02)
+
+
+def test_the_likeness_of_neighbours_is_that_of_each_camera():
+    problem, state, size = observed_with((0.5, 0.0, 0.2), cameras=3)
+    assert likeness(problem, state, size) == pytest.approx([0.5, 0.0, 0.2], abs=0.04)
 
 
 def test_sharp_observations_tell_less_than_their_residuals_show():

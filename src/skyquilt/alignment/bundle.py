@@ -23,7 +23,7 @@ from skyquilt.alignment.oblique_start import (
     turned_priors,
     untold,
 )
-from skyquilt.alignment.outcome import accuracy, ground_points, leave_one_out, undetermined
+from skyquilt.alignment.outcome import accuracy, ground_points, leave_one_out, misfits, undetermined
 from skyquilt.alignment.problem import Problem, State
 from skyquilt.alignment.setup import Setup, camera_records, pose_records, set_up
 from skyquilt.alignment.stages import believe_positions, fine_steps, plain, rough_steps, weighed
@@ -73,7 +73,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 41
+    version: ClassVar[int] = 42
 
     def __call__(
         self,
@@ -354,6 +354,6 @@ def _outcome(
         rejected=weak,
         control=residuals_of_control(control, frame, setup, problem, state, full),
         accuracy=accuracy(setup, problem, state, full) if predicted and full else None,
-        notes=undetermined(setup, problem, state, full),
+        notes=undetermined(setup, problem, state, full) + misfits(setup, problem, state),
         loo_rms_m=leave_one_out(problem, state, full) if setup.georeferenced else None,
     )

@@ -68,7 +68,7 @@ def observed_noise(problem: Problem, state: State, size: Array) -> Noise:
     # the weights enter the normal equations; their variance and slope tell what these are worth
     variance = float((psi**2).sum()) / spare * float(w.mean()) / float((w**2).mean()) ** 2
     del w
-    near = max(_alike(problem, psi, size), 0.0)
+    near = max(_together(_part(problem, size, CELLS), psi), 0.0)
     del psi
     hidden = (HIDDEN * np.maximum(size.max(1) / MATCHED, 1))[problem.photo]
     hidden /= problem.sigma_px
@@ -77,6 +77,19 @@ def observed_noise(problem: Problem, state: State, size: Array) -> Noise:
     crowd = np.bincount(part).astype(float)
     together = float((crowd**2).sum() / crowd.sum())  # in the part of an observation, on average
     return Noise(variance=variance, design_effect=1 + min(near, 1.0) * (together - 1))
+
+
+def likeness(problem: Problem, state: State, size: Array) -> Array:
+    """Correlation (m,) of residuals of different points of an eighth of a photo, for the photos of
+    each camera: 0 = they are independent, 1 = they err as one, as they do where no lens of the
+    model fits. `size` (n, 2): each photo's in px.
+    """
+    psi = np.nan_to_num(residuals_px(problem, state), copy=False)
+    psi /= problem.sigma_px[:, None]
+    psi /= 1 + (psi**2).sum(1, keepdims=True) / problem.loss_px**2
+    part, camera = _part(problem, size, CELLS), problem.camera[problem.photo]
+    each = [camera == row for row in range(len(state.K))]
+    return np.array([_together(part[own], psi[own]) for own in each])
 
 
 def _unknowns(problem: Problem, state: State) -> int:
@@ -96,9 +109,8 @@ def _part(problem: Problem, size: Array, parts: int) -> NDArray[np.int64]:
     return out
 
 
-def _alike(problem: Problem, psi: Array, size: Array) -> float:
-    """Correlation of residuals (N, 2) of different points in the same cell of a photo."""
-    part = _part(problem, size, CELLS)
+def _together(part: NDArray[np.int64], psi: Array) -> float:
+    """Correlation of residuals (N, 2) of different points in the same one of the parts (N,)."""
     count = np.bincount(part).astype(float)
     pairs = float((count * (count - 1)).sum())
     sums = np.stack([np.bincount(part, psi[:, k]) for k in range(2)], 1)

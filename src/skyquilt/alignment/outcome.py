@@ -6,12 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.adjust import Covariance
-from skyquilt.alignment.deviations import point_deviations
+from skyquilt.alignment.deviations import likeness, point_deviations
 from skyquilt.alignment.problem import Problem, State, residuals_px
 from skyquilt.alignment.setup import Setup
 from skyquilt.alignment.stages import heights_above, prune
 from skyquilt.alignment.tracks import Tracks
 from skyquilt.alignment.triangulate import polish, triangulated
+from skyquilt.model.camera import PARAMETERS
 from skyquilt.model.poses import Accuracy, TiePoints, no_ties
 
 Array = NDArray[np.float64]
@@ -23,6 +24,13 @@ UNDETERMINED = 0.4
 """A focal length whose deviation stays above this share of its prior's is not determined: what the
 metadata say of it counts for a sixth or more.
 """
+STRETCHED = 5.0
+"""Deviations of its prior by which a ratio of focal lengths shows a stretched picture, and"""
+UNFIT = 0.3
+"""correlation of residuals within a part of a photo (`deviations.likeness`) that does: 0 to 0.16
+on ordinary flights, 0.43 to 0.55 where one side of the photos is a fifth to a third longer.
+"""
+ASPECT = PARAMETERS.index("aspect")
 
 
 def leave_one_out(
@@ -139,5 +147,35 @@ def undetermined(
                 f" uncertain as its metadata ({100 * share:.1f} %), and heights of the ground with"
                 f" it ({share * height:.2g} m, one standard deviation); control points, oblique"
                 " photos or lines at two heights would."
+            )
+    return tuple(notes)
+
+
+def misfits(setup: Setup, problem: Problem, state: State) -> tuple[str, ...]:
+    """Sentences about cameras whose photos no lens with square pixels fits, or with the pixels that
+    its calibration tells: pictures stretched along one side, and anamorphic lenses.
+    """
+    notes = []
+    alike = likeness(problem, state, setup.size[setup.members])
+    for row, key in enumerate(setup.camera_keys):
+        told, found = problem.K0[row, ASPECT], state.K[row, ASPECT]
+        apart = float(abs(found - told) / problem.sigma_K[row, ASPECT])
+        why = []
+        if problem.free[row, ASPECT] and apart > STRETCHED:
+            why.append(
+                f"self-calibration finds focal lengths along columns and rows of the ratio"
+                f" {found:.3f}, {apart:.0f} deviations from {told:.4g}"
+            )
+        if alike[row] > UNFIT:
+            why.append(
+                f"what no lens explains goes the same way over whole parts of a photo (correlation"
+                f" {alike[row]:.2f}, of other flights at most 0.16)"
+            )
+        if why:
+            notes.append(
+                f"The photos of {key} seem to be stretched: {'; and '.join(why)}. Resizing"
+                " along one side and anamorphic lenses do so. Place and scale of the map may be"
+                " several times as wrong as stated; files as the camera wrote them, or the true"
+                " focal_x and focal_y in --cameras, help."
             )
     return tuple(notes)

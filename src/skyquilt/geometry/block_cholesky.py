@@ -250,7 +250,7 @@ class _Parts:
         self._read = np.empty(0)
         if self._starts[-1] > HELD:
             with suppress(OSError):  # no folder for it that may be written
-                self._file = TemporaryFile(dir=folder_on_disk())
+                self._file = TemporaryFile(dir=folder_on_disk())  # noqa: SIM115 - closed with this
                 self._read = np.empty(max(sizes) // 8)
         self._added = 0
 

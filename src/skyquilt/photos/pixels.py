@@ -182,8 +182,8 @@ def _png(file: BinaryIO, photo: Photo) -> Pixels:
 
 
 def read_tiff(file: BinaryIO, size: tuple[int, int]) -> Pixels:
-    """The first page of a TIFF as (height, width, bands), signed and wide types as float32, black and
-    white as 0 and 255; `size`: the width and height that were checked.
+    """The first page of a TIFF as (height, width, bands), signed and wide types as float32, black
+    and white as 0 and 255; `size`: the width and height that were checked.
     """
     import tifffile  # imported here because most photos are JPEGs
 
