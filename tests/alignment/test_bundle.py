@@ -528,8 +528,8 @@ def test_photos_that_show_nothing_are_told(blank, told):
     + [(1.33, "goes the same way")],
 )
 def test_pictures_that_are_stretched_are_named(aspect, by):
-    (note,) = [n for n in Flown(lens=stretched(aspect)).aligned().notes if "stretched" in n]
-    assert note.startswith("The photos of cam seem to be stretched") and by in note
+    (note,) = [n for n in Flown(lens=stretched(aspect)).aligned().notes if "anamorphic" in n]
+    assert note.startswith("The photos of cam ") and by in note
     if "deviations" in by:
         found = float(note.split("of the ratio ")[1].split(",")[0])
         assert found == pytest.approx(aspect, abs=0.01)
@@ -537,7 +537,7 @@ def test_pictures_that_are_stretched_are_named(aspect, by):
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_ordinary_pictures_are_not_called_stretched(seed):
-    assert not any("stretched" in n for n in Flown(seed).aligned().notes)
+    assert not any("anamorphic" in n for n in Flown(seed).aligned().notes)
 
 
 def test_a_stretched_picture_that_its_calibration_tells_is_not_named():
@@ -546,4 +546,4 @@ def test_a_stretched_picture_that_its_calibration_tells_is_not_named():
     flown.photos = [replace(p, calibration=told) for p in flown.photos]
     found = flown.aligned()
     assert found.cameras["cam"].aspect == pytest.approx(0.75, abs=0.002)
-    assert not any("stretched" in n for n in found.notes)
+    assert not any("anamorphic" in n for n in found.notes)

@@ -153,29 +153,30 @@ def undetermined(
 
 def misfits(setup: Setup, problem: Problem, state: State) -> tuple[str, ...]:
     """Sentences about cameras whose photos no lens with square pixels fits, or with the pixels that
-    its calibration tells: pictures stretched along one side, and anamorphic lenses.
+    its calibration tells: pictures stretched along one side, anamorphic lenses, and shutters that
+    are not what they are taken for.
     """
     notes = []
     alike = likeness(problem, state, setup.size[setup.members])
     for row, key in enumerate(setup.camera_keys):
         told, found = problem.K0[row, ASPECT], state.K[row, ASPECT]
         apart = float(abs(found - told) / problem.sigma_K[row, ASPECT])
-        why = []
         if problem.free[row, ASPECT] and apart > STRETCHED:
-            why.append(
-                f"self-calibration finds focal lengths along columns and rows of the ratio"
-                f" {found:.3f}, {apart:.0f} deviations from {told:.4g}"
+            why = (
+                f"seem to be stretched: self-calibration finds focal lengths along columns and rows"
+                f" of the ratio {found:.3f}, {apart:.0f} deviations from {told:.4g}. Pictures"
             )
-        if alike[row] > UNFIT:
-            why.append(
-                f"what no lens explains goes the same way over whole parts of a photo (correlation"
-                f" {alike[row]:.2f}, of other flights at most 0.16)"
+        elif alike[row] > UNFIT:
+            why = (
+                "do not fit a camera as it is taken for: what is left unexplained goes the same way"
+                f" over whole parts of a photo (correlation {alike[row]:.2f}; where all fits, at"
+                " most 0.16). A rolling shutter that nothing tells (--shutter rolling), pictures"
             )
-        if why:
-            notes.append(
-                f"The photos of {key} seem to be stretched: {'; and '.join(why)}. Resizing"
-                " along one side and anamorphic lenses do so. Place and scale of the map may be"
-                " several times as wrong as stated; files as the camera wrote them, or the true"
-                " focal_x and focal_y in --cameras, help."
-            )
+        else:
+            continue
+        notes.append(
+            f"The photos of {key} {why} that were resized along one side and anamorphic lenses do"
+            " so. Place and scale of the map may be several times as wrong as stated; files as the"
+            " camera wrote them, or the true focal_x and focal_y in --cameras, help."
+        )
     return tuple(notes)
