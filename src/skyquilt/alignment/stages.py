@@ -27,6 +27,10 @@ ASKED, PLACES = 160, 4
 """Photos of a large survey that tell its cameras' first intrinsics, and whether these stood still
 while they exposed; and the places where they were taken. Each camera has one place at least.
 """
+CLEARLY = 9.0
+"""By how much the cost of cameras that stood still must be less than that of moving ones, as their
+positions and times have them: three deviations.
+"""
 DOUBTED = 2.5
 """Positions that a block misses by more than this many deviations are not what they claim."""
 
@@ -194,12 +198,12 @@ def _standing(
     problem: Problem, state: State, keep: Keep, near: NearFactor
 ) -> tuple[Problem, State]:
     """The adjustment as if cameras stood still while they expose, where that explains the photos
-    better: drones that stop for each photo have positions and times as if they flew on.
+    clearly better: drones that stop for each photo have positions and times as if they flew on.
     """
     other, begin = _still(problem, state)
     # as far as the other one was, or the two could not be compared
     stood = adjust(other, begin, iterations=25, tolerance=1e-4, damping=1e-6, keep=keep, near=near)
-    if stood.cost < robust_cost(problem, state):
+    if stood.cost < robust_cost(problem, state) - CLEARLY:
         return other, stood.state
     return problem, state
 
