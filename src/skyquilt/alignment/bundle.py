@@ -11,6 +11,7 @@ from skyquilt.alignment.control import Control, hold_to_control, residuals_of_co
 from skyquilt.alignment.determined import weak_photos
 from skyquilt.alignment.displaced_parts import brought_together
 from skyquilt.alignment.dominant_plane import levelled
+from skyquilt.alignment.equations import NearFactor
 from skyquilt.alignment.late_positions import moved_note, unshifted
 from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
 from skyquilt.alignment.oblique import found_oblique, hung, reported_oblique, tilts_reported
@@ -73,7 +74,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 42
+    version: ClassVar[int] = 43
 
     def __call__(
         self,
@@ -231,9 +232,9 @@ class Bundle:
             del used
             state = triangulated(problem, state)
             make_room()
-        for step in fine_steps(keep.within("fine")):
+        near = NearFactor()
+        for step in fine_steps(keep.within("fine"), near):
             problem, state = step(problem, state)
-        del step
         make_room()
         said = tuple[str, ...]()
         if self.repair:
@@ -245,13 +246,14 @@ class Bundle:
         setup = setup.moving_as(photos, state.C)
         problem = replace(problem, velocity=setup.base.velocity)
         if self.thorough:
-            problem, state = weighed(problem, state, setup, keep.within("weighed"))
+            problem, state = weighed(problem, state, setup, keep.within("weighed"), near)
         else:
-            problem, state = plain(problem, state, keep.within("plain"))
+            problem, state = plain(problem, state, keep.within("plain"), near)
         setup = replace(setup, base=replace(setup.base, velocity=problem.velocity))
         if self.repair:
             part = keep.within("positions")
-            problem, state = believe_positions(problem, state, setup, part)
+            problem, state = believe_positions(problem, state, setup, part, near)
+        del step, near
         problem, state, frame, reports = hold_to_control(problem, state, frame, setup, control)
         make_room()
         ties = ground_points(aside.get(), setup, state)

@@ -177,7 +177,7 @@ class Equations:
         near = self.near if self.n > FACTORED else None
         made = near and near.get()
         matrix, gradient = self.reduced(state, damping)
-        if made:
+        if made and made.total == len(gradient):
             found = conjugate_gradients(
                 matrix.times(), made.solve, gradient, tolerance=STEP_ERROR, most=STEPS
             )

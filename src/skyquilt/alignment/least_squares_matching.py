@@ -58,7 +58,7 @@ class LeastSquaresMatching:
     """Least standard deviation of a refined observation, in usual ones."""
     bluntest: float = 8.0
     """Largest, likewise; also that of observations that keep their place."""
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
 
     def __call__(
         self,

@@ -103,7 +103,7 @@ class LocalAdjustment:
     """Links that put a photo further apart than this share of the flying height contradict each
     other.
     """
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     def __call__(self, window: Window) -> AdjustedWindow | NotAdjusted:
         """Places the new photo and refines the free ones."""

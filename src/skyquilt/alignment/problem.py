@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -256,25 +256,62 @@ class Linearised:
     """(N,) observations whose point lies behind its camera: ignored."""
 
 
-def _local(problem: Problem, state: State) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Points of all observations in coordinates of the camera as it stood when their row was
-    exposed (N, 3), the same for the middle row (N, 3), and which points lie behind.
+class _Seen(NamedTuple):
+    """Points of N observations in the coordinates of their cameras."""
+
+    local: Array
+    """(N, 3) as the camera stood when their row was exposed."""
+    middle: Array
+    """(N, 3) the same for the middle row."""
+    share: Array
+    """(N,) place of their row in the photo, -0.5 at the first and 0.5 at the last."""
+    pace: Array | None
+    """(N, 3) how far they move from the first row to the last; None where nothing moves."""
+    behind: NDArray[np.bool_]
+    """(N,) which points lie behind."""
+
+
+def _seen(problem: Problem, state: State) -> _Seen:
+    """Points of all observations in coordinates of their cameras.
 
     A row is exposed from its own place: local(s) = L + s (turn x L - R velocity readout), where L
     belongs to the middle row and s is the row's share of the photo. Linear in s: turns are some
     hundredths of a radian at most.
+
+    The row is the one in which the point is seen, found from the observed one in one step. An
+    observation's error moves the observed row, too: residuals from there would shrink with the
+    readout, and the one that makes them smallest would be too long.
     """
     photo = problem.photo
     middle = np.einsum("nij,nj->ni", state.R[photo], state.X[problem.point] - state.C[photo])
-    local = middle.copy()
-    if (state.K[:, READOUT] != 0).any():
-        moved = swept(problem, state)
-        local -= problem.share[:, None] * moved[photo]
+    pace = None
+    if (state.K[:, READOUT] != 0).any() and problem.velocity.any():
+        pace = -swept(problem, state)[photo]
     if state.turn.any():
-        local += problem.share[:, None] * np.cross(state.turn[photo], middle)
+        turned = np.cross(state.turn[photo], middle)
+        pace = turned if pace is None else pace + turned
+    share, local = problem.share, middle.copy()
+    if pace is not None:
+        local += share[:, None] * pace
+        behind = local[:, 2] < 1e-6
+        k = state.K[problem.camera[photo], :READOUT]
+        ahead = np.where(behind[:, None], (0.0, 0.0, 1.0), local)
+        off = pixels(ahead[:, :2] / ahead[:, 2:], k)[:, 1] - problem.px[:, 1]
+        share = share + np.where(behind, 0.0, off / problem.last_row[photo])
+        local = middle + share[:, None] * pace
     behind = local[:, 2] < 1e-6
     local[behind] = middle[behind] = (0.0, 0.0, 1.0)
-    return local, middle, behind
+    return _Seen(local, middle, share, pace, behind)
+
+
+def _with_row(problem: Problem, seen: _Seen, d_point: Array, *values: Array) -> Iterator[Array]:
+    """Derivatives, values (N, 2, k), that take into account that the row moves as well."""
+    if seen.pace is None:
+        yield from values
+        return
+    per_row = (d_point @ seen.pace[..., None]) / problem.last_row[problem.photo, None, None]
+    for value in values:
+        yield value + per_row * value[:, 1:2]
 
 
 def swept(problem: Problem, state: State) -> Array:
@@ -285,23 +322,25 @@ def swept(problem: Problem, state: State) -> Array:
 
 def linearise(problem: Problem, state: State) -> Linearised:
     """Residuals and Jacobians at a state."""
-    local, middle, behind = _local(problem, state)
+    seen = _seen(problem, state)
+    local = seen.local
     cameras, some = problem.camera[problem.photo], bool(problem.free.any())
     p = project_with_derivatives(state.K[cameras, :READOUT], local, intrinsics=some)
-    w = (~behind / problem.sigma_px)[:, None]
-    d_point = p.d_point * w[..., None]
+    d_point, d_intrinsics = _with_row(problem, seen, p.d_point, p.d_point, p.d_intrinsics)
+    w = (~seen.behind / problem.sigma_px)[:, None]
+    d_point = d_point * w[..., None]
     J_photo = np.empty((len(local), 2, problem.photo_unknowns))
     J_photo[:, :, :3] = np.cross(local[:, None, :], d_point)  # d . (w x local) = (local x d) . w
     J_point = d_point @ state.R[problem.photo]
     J_photo[:, :, 3:6] = -J_point
     if problem.sigma_turn is not None:
-        turned = np.cross(middle[:, None, :], d_point)
-        J_photo[:, :, 6:] = problem.share[:, None, None] * turned
-    J_camera = p.d_intrinsics
+        turned = np.cross(seen.middle[:, None, :], d_point)
+        J_photo[:, :, 6:] = seen.share[:, None, None] * turned
+    J_camera = d_intrinsics
     if some:
         pace = np.einsum("nki,ni->nk", J_point, problem.velocity[problem.photo])
         J_camera = np.concatenate(
-            [p.d_intrinsics * w[..., None], -(problem.share[:, None] * pace)[..., None]], 2
+            [d_intrinsics * w[..., None], -(seen.share[:, None] * pace)[..., None]], 2
         )
         J_camera *= problem.free[cameras][:, None, :]
     return Linearised(
@@ -309,17 +348,18 @@ def linearise(problem: Problem, state: State) -> Linearised:
         J_photo=J_photo,
         J_camera=J_camera,
         J_point=J_point,
-        behind=behind,
+        behind=seen.behind,
     )
 
 
 def linearised_points(problem: Problem, state: State) -> tuple[Array, Array]:
     """`residual` (N, 2) and `J_point` (N, 2, 3) of `linearise` alone."""
-    local, _, behind = _local(problem, state)
+    seen = _seen(problem, state)
     k = state.K[problem.camera[problem.photo], :READOUT]
-    p = project_with_derivatives(k, local, intrinsics=False)
-    w = (~behind / problem.sigma_px)[:, None]
-    return (p.px - problem.px) * w, (p.d_point * w[..., None]) @ state.R[problem.photo]
+    p = project_with_derivatives(k, seen.local, intrinsics=False)
+    (d_point,) = _with_row(problem, seen, p.d_point, p.d_point)
+    w = (~seen.behind / problem.sigma_px)[:, None]
+    return (p.px - problem.px) * w, (d_point * w[..., None]) @ state.R[problem.photo]
 
 
 def residuals_px(problem: Problem, state: State) -> Array:
@@ -347,9 +387,9 @@ def _residuals(problem: Problem, state: State) -> Iterator[tuple[slice, Array]]:
     for lo in range(0, len(problem.px), PART):
         some = slice(lo, lo + PART)
         part = problem.at(some)
-        local, _, behind = _local(part, state)
-        px = pixels(local[:, :2] / local[:, 2:], state.K[part.camera[part.photo], :READOUT])
-        yield some, np.where(behind[:, None], np.nan, px - part.px)
+        seen, k = _seen(part, state), state.K[part.camera[part.photo], :READOUT]
+        px = pixels(seen.local[:, :2] / seen.local[:, 2:], k)
+        yield some, np.where(seen.behind[:, None], np.nan, px - part.px)
 
 
 def attitude_error(R: Array, R0: Array) -> Array:

@@ -27,6 +27,10 @@ ASKED, PLACES = 160, 4
 """Photos of a large survey that tell its cameras' first intrinsics, and whether these stood still
 while they exposed; and the places where they were taken. Each camera has one place at least.
 """
+CLEARLY = 9.0
+"""By how much the cost of cameras that stood still must be less than that of moving ones, as their
+positions and times have them: three deviations.
+"""
 DOUBTED = 2.5
 """Positions that a block misses by more than this many deviations are not what they claim."""
 
@@ -87,11 +91,11 @@ def fine(problem: Problem, state: State, keep: Keep = MADE_NOW) -> tuple[Problem
     return problem, state
 
 
-def fine_steps(keep: Keep = MADE_NOW) -> tuple[Step, ...]:
+def fine_steps(keep: Keep = MADE_NOW, near: NearFactor | None = None) -> tuple[Step, ...]:
     """Second stage: all unknowns free under ever narrower losses; outliers are removed in
-    between.
+    between. `near` serves these and later stages.
     """
-    near = NearFactor()
+    near = near or NearFactor()
 
     def under(loss_px: float, iterations: int, tolerance: float) -> Step:
         def step(problem: Problem, state: State) -> tuple[Problem, State]:
@@ -117,15 +121,19 @@ def _pruning(limit: float) -> Step:
 
 
 def weighed(
-    problem: Problem, state: State, setup: Setup, keep: Keep = MADE_NOW
+    problem: Problem,
+    state: State,
+    setup: Setup,
+    keep: Keep = MADE_NOW,
+    near: NearFactor | None = None,
 ) -> tuple[Problem, State]:
     """The adjustment repeated with observations as sharp as their patches and their residuals show
     them to be, and with the weight that those are worth; where rows were exposed one after the
     other, with turns of the cameras, or with cameras that stood still, whichever explains the
-    photos better. Of large surveys, some photos tell.
+    photos better. Of large surveys, some photos tell, also whether turns are worth estimating.
     """
     problem = replace(problem, sigma_px=problem.sigma_px * problem.relative, relative=1.0)
-    sizes, near = setup.size[setup.members], NearFactor()
+    sizes, near = setup.size[setup.members], near or NearFactor()
     rolls, many = _rolls(problem, state), _is_large(problem)
     if rolls:
         readout = np.abs(state.K[problem.camera, READOUT])
@@ -134,8 +142,11 @@ def weighed(
         chosen = _places_of(problem, state)
         some, its = problem.among(chosen, state)
         some, its = _reweighed(some, its, sizes[chosen], MADE_NOW, NearFactor())
-        if _standing(some, its, MADE_NOW, NearFactor())[0] is not some:
+        best, there = _standing(some, its, MADE_NOW, NearFactor())
+        if best is not some:
             problem, state = _still(problem, state)
+        if not _turning(best, there):
+            problem = replace(problem, sigma_turn=None)
     problem, state = _reweighed(problem, state, sizes, keep, near)
     if rolls and not many:
         return _standing(problem, state, keep.within("still"), near)
@@ -168,13 +179,13 @@ def _reweighed(
     return problem, state
 
 
-def plain(problem: Problem, state: State, keep: Keep) -> tuple[Problem, State]:
+def plain(problem: Problem, state: State, keep: Keep, near: NearFactor) -> tuple[Problem, State]:
     """In place of `weighed`, in a third of the time: observations keep their weights, and only
     drones that stop are told from those that fly on.
     """
     if not _rolls(problem, state):
         return problem, state
-    return _standing(problem, state, keep, NearFactor())
+    return _standing(problem, state, keep, near)
 
 
 def _rolls(problem: Problem, state: State) -> bool:
@@ -187,12 +198,12 @@ def _standing(
     problem: Problem, state: State, keep: Keep, near: NearFactor
 ) -> tuple[Problem, State]:
     """The adjustment as if cameras stood still while they expose, where that explains the photos
-    better: drones that stop for each photo have positions and times as if they flew on.
+    clearly better: drones that stop for each photo have positions and times as if they flew on.
     """
     other, begin = _still(problem, state)
     # as far as the other one was, or the two could not be compared
     stood = adjust(other, begin, iterations=25, tolerance=1e-4, damping=1e-6, keep=keep, near=near)
-    if stood.cost < robust_cost(problem, state):
+    if stood.cost < robust_cost(problem, state) - CLEARLY:
         return other, stood.state
     return problem, state
 
@@ -203,6 +214,13 @@ def _still(problem: Problem, state: State) -> tuple[Problem, State]:
     K[:, READOUT] = problem.K0[:, READOUT]
     still = replace(problem, velocity=problem.velocity * 0.0)
     return still, replace(state, K=K, turn=np.zeros_like(state.turn))
+
+
+def _turning(problem: Problem, state: State) -> bool:
+    """Whether turns of the cameras explain more than chance would: a unit of the cost for each."""
+    steady, begin = replace(problem, sigma_turn=None), replace(state, turn=state.turn * 0.0)
+    without = adjust(steady, begin, iterations=15, tolerance=1e-4, damping=1e-6)
+    return without.cost - robust_cost(problem, state) > state.turn.size
 
 
 def _is_large(problem: Problem) -> bool:
@@ -242,7 +260,11 @@ def prune(problem: Problem, state: State, limit: float) -> tuple[Problem, State]
 
 
 def believe_positions(
-    problem: Problem, state: State, setup: Setup, keep: Keep = MADE_NOW
+    problem: Problem,
+    state: State,
+    setup: Setup,
+    keep: Keep = MADE_NOW,
+    near: NearFactor | None = None,
 ) -> tuple[Problem, State]:
     """Positions believed as far as the photos confirm them.
 
@@ -254,7 +276,7 @@ def believe_positions(
     GPS that states centimetres), and what the start gave stays.
     """
     started = problem.sigma_C
-    doubted, near = np.zeros(started.shape, bool), NearFactor()
+    doubted, near = np.zeros(started.shape, bool), near or NearFactor()
     for again in range(3):
         error = state.C - problem.C0
         sigma = started.copy()

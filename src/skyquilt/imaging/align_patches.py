@@ -39,21 +39,36 @@ def translate(
     slope = np.stack([gx.reshape(n, -1), gy.reshape(n, -1)], 1)
     H = slope @ np.swapaxes(slope, 1, 2) + 1e-6 * np.eye(2, dtype=np.float32)
     # what offset and gain do not take up
-    taken = np.stack([slope.mean(2) * s, np.einsum("nki,ni->nk", slope, ref)], 2)
+    taken = np.stack([slope.mean(2) * s, _times(slope, ref)], 2)
     held = H.astype(np.float64) - taken @ np.swapaxes(taken, 1, 2)
-    J = np.linalg.solve(H, slope)
+    H_inv = _inverse(H.astype(np.float64))
     shift = np.zeros((n, 2))
     for _ in range(iterations):
         current = _normalised(_sampled(moving, shift, margin, s))
-        shift -= np.einsum("nki,ni->nk", J, current - ref)
+        shift -= _times(H_inv, _times(slope, current - ref))
         shift = np.clip(np.nan_to_num(shift), -margin, margin)
     current = _normalised(_sampled(moving, shift, margin, s))
     score = np.einsum("ni,ni->n", current, ref)
     lost = (np.abs(shift) >= margin - 1e-6).any(1) | ~np.isfinite(score)
     shift[lost], score[lost] = np.nan, np.nan
-    misfit = np.nan_to_num(current - score[:, None].astype(np.float32) * ref)
+    misfit = current - score[:, None].astype(np.float32) * ref
+    misfit[lost] = 0
     pull = (slope * misfit[:, None]).reshape(n, 2, s, s)
     return shift, score, _deviation(held, pull, (misfit**2).sum(1))
+
+
+def _times(matrix: NDArray[Any], vector: NDArray[Any]) -> NDArray[Any]:
+    """Products (n, k) of matrices (n, k, i) with vectors (n, i)."""
+    return np.asarray((matrix @ vector[..., None])[..., 0])
+
+
+def _inverse(symmetric: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Inverses of symmetric matrices (n, 2, 2), written out: a library's loop over so many small
+    ones takes longer than all else.
+    """
+    a, b, d = symmetric[:, 0, 0], symmetric[:, 0, 1], symmetric[:, 1, 1]
+    turned = np.stack([np.stack([d, -b], 1), np.stack([-b, a], 1)], 1)
+    return np.asarray(turned / (a * d - b * b)[:, None, None])
 
 
 def _deviation(
@@ -75,7 +90,7 @@ def _deviation(
     spare = s * s / (s * s - 4)
     # central differences of white noise have half of its variance
     noise = np.minimum(squares * spare / 4, MOST_NOISE * weakest)
-    G_inv = np.linalg.inv(H - noise[:, None, None] * np.eye(2))
+    G_inv = _inverse(H - noise[:, None, None] * np.eye(2))
     S = _of_squares(pull).astype(np.float64) * spare
     return np.asarray(np.sqrt(np.maximum(np.einsum("nij,njk,nki->n", G_inv, S, G_inv) / 2, 0)))
 
@@ -96,10 +111,9 @@ def _of_squares(pull: Float) -> Float:
 
 def _normalised(flat: Float) -> Float:
     """Rows of zero mean and unit length; NaN where a row is constant."""
-    centred = flat - flat.mean(1, keepdims=True)
-    length = np.linalg.norm(centred, axis=1, keepdims=True)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(length > 1e-3, centred / length, np.float32(np.nan))
+    out = flat - flat.mean(1, keepdims=True)
+    length = np.sqrt(np.einsum("ni,ni->n", out, out))
+    return np.asarray(out / np.where(length > 1e-3, length, np.float32(np.nan))[:, None])
 
 
 def _sampled(moving: Float, shift: NDArray[np.float64], margin: int, s: int) -> Float:
@@ -109,12 +123,8 @@ def _sampled(moving: Float, shift: NDArray[np.float64], margin: int, s: int) -> 
     part = (shift - whole).astype(np.float32)
     x0 = np.clip(margin + whole[:, 0], 0, 2 * margin - 1)
     y0 = np.clip(margin + whole[:, 1], 0, 2 * margin - 1)
-    span = np.arange(s + 1)
-    block = moving[
-        np.arange(n)[:, None, None],
-        (y0[:, None] + span)[:, :, None],
-        (x0[:, None] + span)[:, None, :],
-    ]
+    windows = np.lib.stride_tricks.sliding_window_view(moving, (s + 1, s + 1), axis=(1, 2))
+    block = windows[np.arange(n), y0, x0]
     fx, fy = part[:, 0, None, None], part[:, 1, None, None]
-    rows = block[:, :, :-1] * (1 - fx) + block[:, :, 1:] * fx
-    return np.asarray(rows[:, :-1] * (1 - fy) + rows[:, 1:] * fy).reshape(n, -1)
+    rows = block[:, :, :-1] + (block[:, :, 1:] - block[:, :, :-1]) * fx
+    return np.asarray(rows[:, :-1] + (rows[:, 1:] - rows[:, :-1]) * fy).reshape(n, -1)
