@@ -109,9 +109,32 @@ class Agree:
         self, fields: Fields, target: Fields, both: NDArray[Any], across: int, first: int = 0
     ) -> Iterator[tuple[float, float, float, float, float, float]]:
         """Rank, centre, shift and width of the peak of each patch, from row and column `first`."""
+        reach = self.reach
+        for top, left, side, score in self.scored(fields, target, both, across, reach, first):
+            x, y = _summit(score)
+            yield (
+                self._rank(score),
+                left + (side - 1) / 2,
+                top + (side - 1) / 2,
+                reach - x,
+                reach - y,
+                _width(score),
+            )
+
+    def scored(
+        self,
+        fields: Fields,
+        target: Fields,
+        both: NDArray[Any],
+        across: int,
+        reach: int,
+        first: int = 0,
+    ) -> Iterator[tuple[int, int, int, NDArray[np.float32]]]:
+        """Row, column and side of each patch of the target that both images cover, and its
+        correlation with the fields at all shifts up to `reach` px, from row and column `first`.
+        """
         height, width = both.shape
         side = int(np.sqrt(height * width) / across)
-        reach = self.reach
         padded = cv2.copyMakeBorder(
             fields, reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=(0,) * 4
         )
@@ -121,16 +144,7 @@ class Agree:
                 if both[part].mean() < self.filled:
                     continue
                 around = padded[top : top + side + 2 * reach, left : left + side + 2 * reach]
-                score = scores(around, target[part] * both[part][..., None])
-                x, y = _summit(score)
-                yield (
-                    self._rank(score),
-                    left + (side - 1) / 2,
-                    top + (side - 1) / 2,
-                    reach - x,
-                    reach - y,
-                    _width(score),
-                )
+                yield top, left, side, _scores(around, target[part] * both[part][..., None])
 
     def _rank(self, score: NDArray[Any]) -> float:
         """Share of positions at least as good as the registered one, each with its
@@ -143,7 +157,7 @@ class Agree:
         return float((1 + (rivals >= own).sum()) / (1 + rivals.size))
 
 
-def scores(around: Fields, patch: Fields) -> NDArray[np.float32]:
+def _scores(around: Fields, patch: Fields) -> NDArray[np.float32]:
     """Normalised correlation of a patch (s, s, 4) at every position in its surroundings."""
     side = patch.shape[0]
     energy = cv2.boxFilter(

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
-import scipy.fft
 from numpy.typing import NDArray
 
 from skyquilt.coregistration.agreement import Agree, Agreement, Shifts
@@ -14,10 +13,10 @@ from skyquilt.coregistration.orientation import (
     BLUR,
     Orientation,
     Pyramid,
+    at_all_shifts,
     between,
     full_size,
-    spectra,
-    warped,
+    own_radius,
 )
 from skyquilt.coregistration.refine_registration import grid
 from skyquilt.coregistration.repeats import Repeats, Rival
@@ -184,8 +183,6 @@ def _repeated(rival: Rival, pyramid: Pyramid) -> str:
 
 _NEAR = 2
 """Radius in px around the registered position in which its peak is searched."""
-_OWN = 0.03
-"""Share of the image around the registered position that belongs to its peak."""
 _LEAST = 0.3
 """Shifts with a smaller share of the overlap are ignored."""
 
@@ -196,15 +193,8 @@ def distinctness(a: Orientation, b: Orientation, b_H_a: Matrix) -> float:
     Unlike the correlation it can be compared between images, since smooth images also correlate by
     chance.
     """
-    fields, valid = warped(a, b_H_a, b.shape)
-    shape = (scipy.fft.next_fast_len(2 * b.shape[0]), scipy.fft.next_fast_len(2 * b.shape[1]))
-    cross = (spectra(fields, shape) * np.conj(spectra(b.fields, shape))).sum(0)
-    masks = scipy.fft.fft2(valid, s=shape) * np.conj(scipy.fft.fft2(b.valid, s=shape))
-    overlap = scipy.fft.ifft2(masks).real
-    field = scipy.fft.ifft2(cross).real
-    z = np.where(overlap > _LEAST * overlap[0, 0], field / np.sqrt(np.maximum(overlap, 1)), 0)
-    far = overlap > _LEAST * overlap[0, 0]
-    own = np.arange(-max(4, int(_OWN * b.shape[0])), max(4, int(_OWN * b.shape[0])) + 1)
+    z, far = at_all_shifts(a, b, b_H_a, _LEAST)
+    own = np.arange(-own_radius(b.shape), own_radius(b.shape) + 1)
     far[np.ix_(own, own)] = False
     near = np.arange(-_NEAR, _NEAR + 1)
     noise = float(np.sqrt((z[far] ** 2).mean())) if far.any() else 0.0

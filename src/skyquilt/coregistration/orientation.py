@@ -32,6 +32,8 @@ FLOOR = 0.3
 """Share of the median contrast that is added to every contrast, so that flat areas stay weak."""
 STRONGEST = 2.0
 """Largest weight, so that a single bright object does not dominate."""
+_OWN = 0.03
+"""Share of the image around a place that belongs to its peak."""
 MARGIN = 5
 """Width in px of the neighbourhood that must be valid for a gradient to be used."""
 
@@ -158,6 +160,29 @@ def spectra(fields: Fields, shape: tuple[int, int]) -> NDArray[np.complex64]:
     """Fourier transforms (2, h, w) of both complex fields, padded to `shape`."""
     both = np.ascontiguousarray(fields).view(np.complex64)
     return np.asarray(scipy.fft.fft2(np.moveaxis(both, -1, 0), s=shape, axes=(1, 2)))
+
+
+def own_radius(shape: tuple[int, int]) -> int:
+    """Radius in px around a place that belongs to its peak, in pictures of this shape."""
+    return max(4, int(_OWN * shape[0]))
+
+
+def at_all_shifts(
+    a: Orientation, b: Orientation, b_H_a: Matrix, overlap: float
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """How well a fits b at all shifts of a transform: the sum of products over the root of the
+    overlap, and whether the overlap is above a share of that at the transform; 0 where it is not.
+
+    Element (y, x), counted from the end where negative, compares a at p + (x, y) with b at p.
+    """
+    fields, valid = warped(a, b_H_a, b.shape)
+    shape = (scipy.fft.next_fast_len(2 * b.shape[0]), scipy.fft.next_fast_len(2 * b.shape[1]))
+    cross = (spectra(fields, shape) * np.conj(spectra(b.fields, shape))).sum(0)
+    masks = scipy.fft.fft2(valid, s=shape) * np.conj(scipy.fft.fft2(b.valid, s=shape))
+    shared = scipy.fft.ifft2(masks).real
+    field = scipy.fft.ifft2(cross).real
+    enough = shared > overlap * shared[0, 0]
+    return np.where(enough, field / np.sqrt(np.maximum(shared, 1)), 0), enough
 
 
 class Pyramid:

@@ -9,23 +9,21 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
-import cv2
 import numpy as np
-import scipy.fft
-from numpy.typing import NDArray
 
-from skyquilt.coregistration.agreement import Agree, scores
-from skyquilt.coregistration.orientation import Fields, Orientation, spectra, warped
-from skyquilt.coregistration.subpixel import Fit, SubpixelRefinement
+from skyquilt.coregistration.agreement import Agree
+from skyquilt.coregistration.orientation import Orientation, at_all_shifts, own_radius, warped
+from skyquilt.coregistration.subpixel import SubpixelRefinement
 from skyquilt.model.registration import Matrix
+
+Correlations = dict[tuple[int, int], float]
+"""Correlation of each patch, by its row and column."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rival:
     """Another place at which the pictures fit."""
 
-    fit: Fit
-    """The transform, in px of the resolution of the fields."""
     shift: tuple[float, float]
     """From the registered place to it, along x and y, px of b."""
     lead: float
@@ -59,33 +57,25 @@ class Repeats:
 
     def __call__(self, a: Orientation, b: Orientation, b_H_a: Matrix, agree: Agree) -> Rival | None:
         """The strongest rival of a transform in px of this resolution; None if there is none."""
-        found = []
+        starts, found = list(self._places(a, b, b_H_a, agree)), []
+        here = _correlations(a, b, b_H_a, agree) if starts else {}
         middle = np.array([b.shape[1] / 2, b.shape[0] / 2, 1.0])
-        for start in self._places(a, b, b_H_a, agree):
+        for start in starts:
             fit = SubpixelRefinement(steps=3)(a, b, start)
             moved = fit.b_H_a @ np.linalg.inv(b_H_a) @ middle
             shift = moved[:2] / moved[2] - middle[:2]
             if np.hypot(*shift) > _own(b.shape, agree) / 2:
-                lead = self._lead(a, b, b_H_a, fit.b_H_a, agree)
+                lead = self._lead(here, _correlations(a, b, fit.b_H_a, agree))
                 if lead is not None and lead < self.clear:
-                    found.append(
-                        Rival(fit=fit, shift=(float(shift[0]), float(shift[1])), lead=lead)
-                    )
+                    found.append(Rival(shift=(float(shift[0]), float(shift[1])), lead=lead))
         return min(found, key=lambda r: r.lead, default=None)
 
     def _places(
         self, a: Orientation, b: Orientation, b_H_a: Matrix, agree: Agree
     ) -> Iterator[Matrix]:
         """Shifts of the transform to other peaks of the correlation that are nearly as high."""
-        fields, valid = warped(a, b_H_a, b.shape)
-        shape = (scipy.fft.next_fast_len(2 * b.shape[0]), scipy.fft.next_fast_len(2 * b.shape[1]))
-        cross = (spectra(fields, shape) * np.conj(spectra(b.fields, shape))).sum(0)
-        masks = scipy.fft.fft2(valid, s=shape) * np.conj(scipy.fft.fft2(b.valid, s=shape))
-        overlap = scipy.fft.ifft2(masks).real
-        field = scipy.fft.ifft2(cross).real
-        z = np.where(
-            overlap > self.overlap * overlap[0, 0], field / np.sqrt(np.maximum(overlap, 1)), 0
-        )
+        z, _ = at_all_shifts(a, b, b_H_a, self.overlap)
+        shape = z.shape
         near = np.arange(-agree.near, agree.near + 1)
         least = self.nearly * float(z[np.ix_(near, near)].max())
         around = np.arange(-_own(b.shape, agree), _own(b.shape, agree) + 1)
@@ -99,11 +89,8 @@ class Repeats:
             yield np.array([[1, 0, -back[0]], [0, 1, -back[1]], [0, 0, 1.0]]) @ b_H_a
             z[np.ix_((y + around) % shape[0], (x + around) % shape[1])] = 0
 
-    def _lead(
-        self, a: Orientation, b: Orientation, own: Matrix, other: Matrix, agree: Agree
-    ) -> float | None:
+    def _lead(self, here: Correlations, there: Correlations) -> float | None:
         """None if too few patches are covered at both places."""
-        here, there = (_correlations(a, b, place, agree) for place in (own, other))
         difference = np.array([here[at] - there[at] for at in here if at in there])
         if len(difference) < self.fewest:
             return None
@@ -113,25 +100,11 @@ class Repeats:
 
 def _own(shape: tuple[int, int], agree: Agree) -> int:
     """Radius in px around a place that belongs to its peak."""
-    return max(4, int(0.03 * shape[0])) + agree.near + 1
+    return own_radius(shape) + agree.near + 1
 
 
-def _correlations(
-    a: Orientation, b: Orientation, b_H_a: Matrix, agree: Agree
-) -> dict[tuple[int, int], float]:
+def _correlations(a: Orientation, b: Orientation, b_H_a: Matrix, agree: Agree) -> Correlations:
     """Best correlation of each patch within `agree.near` px of a transform, by row and column."""
     fields, valid = warped(a, b_H_a, b.shape)
-    both = valid * b.valid
-    side, near = int(np.sqrt(both.size) / agree.across[0]), agree.near
-    padded: Fields = cv2.copyMakeBorder(
-        fields, near, near, near, near, cv2.BORDER_CONSTANT, value=(0,) * 4
-    )
-    found: dict[tuple[int, int], float] = {}
-    for top in range(0, both.shape[0] - side + 1, side):
-        for left in range(0, both.shape[1] - side + 1, side):
-            part = (slice(top, top + side), slice(left, left + side))
-            if both[part].mean() >= agree.filled:
-                around = padded[top : top + side + 2 * near, left : left + side + 2 * near]
-                patch: NDArray[np.float32] = b.fields[part] * both[part][..., None]
-                found[top, left] = float(scores(around, patch).max())
-    return found
+    found = agree.scored(fields, b.fields, valid * b.valid, agree.across[0], agree.near)
+    return {(top, left): float(score.max()) for top, left, _, score in found}
