@@ -60,10 +60,7 @@ def robust_scale(problem: Problem, state: State) -> float:
 
 def observed_noise(problem: Problem, state: State, size: Array) -> Noise:
     """The noise of the observations at a minimum; `size` (n, 2): each photo's in px."""
-    psi = np.nan_to_num(residuals_px(problem, state), copy=False)  # of millions of observations
-    psi /= problem.sigma_px[:, None]
-    w = 1 / (1 + (psi**2).sum(1) / problem.loss_px**2)
-    psi *= w[:, None]
+    psi, w = _weighted(problem, state)
     spare = max(2 * len(psi) - _unknowns(problem, state), 1)
     # the weights enter the normal equations; their variance and slope tell what these are worth
     variance = float((psi**2).sum()) / spare * float(w.mean()) / float((w**2).mean()) ** 2
@@ -84,12 +81,19 @@ def likeness(problem: Problem, state: State, size: Array) -> Array:
     each camera: 0 = they are independent, 1 = they err as one, as they do where no lens of the
     model fits. `size` (n, 2): each photo's in px.
     """
-    psi = np.nan_to_num(residuals_px(problem, state), copy=False)
-    psi /= problem.sigma_px[:, None]
-    psi /= 1 + (psi**2).sum(1, keepdims=True) / problem.loss_px**2
+    psi, _ = _weighted(problem, state)
     part, camera = _part(problem, size, CELLS), problem.camera[problem.photo]
     each = [camera == row for row in range(len(state.K))]
     return np.array([_together(part[own], psi[own]) for own in each])
+
+
+def _weighted(problem: Problem, state: State) -> tuple[Array, Array]:
+    """Residuals (N, 2) in deviations times their robust weights, and these (N,)."""
+    psi = np.nan_to_num(residuals_px(problem, state), copy=False)  # of millions of observations
+    psi /= problem.sigma_px[:, None]
+    w = 1 / (1 + (psi**2).sum(1) / problem.loss_px**2)
+    psi *= w[:, None]
+    return psi, w
 
 
 def _unknowns(problem: Problem, state: State) -> int:

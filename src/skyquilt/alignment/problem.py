@@ -269,6 +269,8 @@ class _Seen(NamedTuple):
     """(N, 3) how far they move from the first row to the last; None where nothing moves."""
     behind: NDArray[np.bool_]
     """(N,) which points lie behind."""
+    k: Array
+    """(N, 10) intrinsics of their cameras."""
 
 
 def _seen(problem: Problem, state: State) -> _Seen:
@@ -290,26 +292,27 @@ def _seen(problem: Problem, state: State) -> _Seen:
     if state.turn.any():
         turned = np.cross(state.turn[photo], middle)
         pace = turned if pace is None else pace + turned
-    share, local = problem.share, middle.copy()
+    share, local, k = problem.share, middle.copy(), state.K[problem.camera[photo], :READOUT]
     if pace is not None:
         local += share[:, None] * pace
         behind = local[:, 2] < 1e-6
-        k = state.K[problem.camera[photo], :READOUT]
         ahead = np.where(behind[:, None], (0.0, 0.0, 1.0), local)
         off = pixels(ahead[:, :2] / ahead[:, 2:], k)[:, 1] - problem.px[:, 1]
         share = share + np.where(behind, 0.0, off / problem.last_row[photo])
         local = middle + share[:, None] * pace
     behind = local[:, 2] < 1e-6
     local[behind] = middle[behind] = (0.0, 0.0, 1.0)
-    return _Seen(local, middle, share, pace, behind)
+    return _Seen(local, middle, share, pace, behind, k)
 
 
-def _with_row(problem: Problem, seen: _Seen, d_point: Array, *values: Array) -> Iterator[Array]:
-    """Derivatives, values (N, 2, k), that take into account that the row moves as well."""
+def _with_row(problem: Problem, seen: _Seen, *values: Array) -> Iterator[Array]:
+    """Derivatives (N, 2, k), first those by the point, that take into account that the row moves as
+    well.
+    """
     if seen.pace is None:
         yield from values
         return
-    per_row = (d_point @ seen.pace[..., None]) / problem.last_row[problem.photo, None, None]
+    per_row = (values[0] @ seen.pace[..., None]) / problem.last_row[problem.photo, None, None]
     for value in values:
         yield value + per_row * value[:, 1:2]
 
@@ -322,11 +325,10 @@ def swept(problem: Problem, state: State) -> Array:
 
 def linearise(problem: Problem, state: State) -> Linearised:
     """Residuals and Jacobians at a state."""
-    seen = _seen(problem, state)
+    seen, some = _seen(problem, state), bool(problem.free.any())
     local = seen.local
-    cameras, some = problem.camera[problem.photo], bool(problem.free.any())
-    p = project_with_derivatives(state.K[cameras, :READOUT], local, intrinsics=some)
-    d_point, d_intrinsics = _with_row(problem, seen, p.d_point, p.d_point, p.d_intrinsics)
+    p = project_with_derivatives(seen.k, local, intrinsics=some)
+    d_point, d_intrinsics = _with_row(problem, seen, p.d_point, p.d_intrinsics)
     w = (~seen.behind / problem.sigma_px)[:, None]
     d_point = d_point * w[..., None]
     J_photo = np.empty((len(local), 2, problem.photo_unknowns))
@@ -342,7 +344,7 @@ def linearise(problem: Problem, state: State) -> Linearised:
         J_camera = np.concatenate(
             [d_intrinsics * w[..., None], -(seen.share[:, None] * pace)[..., None]], 2
         )
-        J_camera *= problem.free[cameras][:, None, :]
+        J_camera *= problem.free[problem.camera[problem.photo]][:, None, :]
     return Linearised(
         residual=(p.px - problem.px) * w,
         J_photo=J_photo,
@@ -355,9 +357,8 @@ def linearise(problem: Problem, state: State) -> Linearised:
 def linearised_points(problem: Problem, state: State) -> tuple[Array, Array]:
     """`residual` (N, 2) and `J_point` (N, 2, 3) of `linearise` alone."""
     seen = _seen(problem, state)
-    k = state.K[problem.camera[problem.photo], :READOUT]
-    p = project_with_derivatives(k, seen.local, intrinsics=False)
-    (d_point,) = _with_row(problem, seen, p.d_point, p.d_point)
+    p = project_with_derivatives(seen.k, seen.local, intrinsics=False)
+    (d_point,) = _with_row(problem, seen, p.d_point)
     w = (~seen.behind / problem.sigma_px)[:, None]
     return (p.px - problem.px) * w, (d_point * w[..., None]) @ state.R[problem.photo]
 
@@ -387,8 +388,8 @@ def _residuals(problem: Problem, state: State) -> Iterator[tuple[slice, Array]]:
     for lo in range(0, len(problem.px), PART):
         some = slice(lo, lo + PART)
         part = problem.at(some)
-        seen, k = _seen(part, state), state.K[part.camera[part.photo], :READOUT]
-        px = pixels(seen.local[:, :2] / seen.local[:, 2:], k)
+        seen = _seen(part, state)
+        px = pixels(seen.local[:, :2] / seen.local[:, 2:], seen.k)
         yield some, np.where(seen.behind[:, None], np.nan, px - part.px)
 
 

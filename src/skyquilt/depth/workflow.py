@@ -161,7 +161,7 @@ def _without_bad(
         try:
             return *(yield from _by_route(route, given, settings, relief_m, clock)), given
         except PhotoFailedError as error:
-            failed = given.failing(error, total)
+            failed = given.failing(error, given.gone(), total)
         for photo in failed:
             yield Note(text=f"{photo.name} is left out: {photo.reason}", warning=True)
         given = given.without(failed)

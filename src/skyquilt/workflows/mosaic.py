@@ -32,7 +32,6 @@ from skyquilt.ortho.orthomosaic import SPOOL
 from skyquilt.ortho.radiometry import value_figures
 from skyquilt.outside import read_bounded
 from skyquilt.photos.headers import content_digest
-from skyquilt.photos.pixels import lost
 from skyquilt.photos.read import ReadFiles
 from skyquilt.quality.clip_figures import clip_figures
 from skyquilt.quality.placement import placement_quality
@@ -258,13 +257,13 @@ def _without_bad(
             return metrics, given, key
         except PhotoFailedError as error:
             log_error(make.output, str(error), error)
-            failed = given.failing(error, total)
+            gone = given.gone()
+            failed = given.failing(error, gone, total)
         for photo in failed:
             yield Note(text=f"{photo.name} is left out: {photo.reason}", warning=True)
-        gone = [p for p in given.survey.photos if lost(p)]
         given = given.without(failed)
         if gone:
-            still = still.without([p for p in failed if p.name in {g.name for g in gone}])
+            still = still.without(gone)
             key = run_key(still, make.settings, make.methods)
 
 

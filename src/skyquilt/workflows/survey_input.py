@@ -51,16 +51,25 @@ class SurveyInput:
         """The name of the folder, or the number of files."""
         return str(self.source) if isinstance(self.source, Path) else f"{len(self.source)} files"
 
-    def failing(self, error: PhotoFailedError, total: int) -> tuple[RejectedPhoto, ...]:
+    def gone(self) -> tuple[RejectedPhoto, ...]:
+        """Photos whose files are no longer the ones that were read."""
+        return tuple(
+            RejectedPhoto(name=p.name, reason=reason)
+            for p in self.survey.photos
+            if (reason := lost(p))
+        )
+
+    def failing(
+        self, error: PhotoFailedError, gone: Sequence[RejectedPhoto], total: int
+    ) -> tuple[RejectedPhoto, ...]:
         """Photos that cannot be used any more: first the one on which a step failed, then those
-        whose files are no longer the ones that were read.
+        that are `gone`.
 
         Raises:
             SkyquiltError: they are more than half of `total`, the photos at the start, so it is not
                 the photos that are bad.
         """
-        gone = {p.name: reason for p in self.survey.photos if (reason := lost(p))}
-        failed = {error.photo: error.reason} | gone
+        failed = {error.photo: error.reason} | {p.name: p.reason for p in gone}
         left = len(self.survey.photos) - len(failed)
         if 2 * left < total:
             name, reason = next(iter(failed.items()))
