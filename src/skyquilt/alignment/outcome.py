@@ -25,10 +25,11 @@ UNDETERMINED = 0.4
 metadata say of it counts for a sixth or more.
 """
 STRETCHED = 5.0
-"""Deviations of its prior by which a ratio of focal lengths shows a stretched picture, and"""
+"""A ratio of focal lengths this many deviations off its prior shows a stretched picture."""
 UNFIT = 0.3
-"""correlation of residuals within a part of a photo (`deviations.likeness`) that does: 0 to 0.16
-on ordinary flights, 0.43 to 0.55 where one side of the photos is a fifth to a third longer.
+"""Residuals that correlate this much within parts of a photo (`deviations.likeness`) show that no
+lens fits: 0 to 0.16 on ordinary flights, 0.43 to 0.56 where one side of the photos is a fifth to a
+third longer.
 """
 ASPECT = PARAMETERS.index("aspect")
 
