@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skyquilt.alignment.contradicted_positions import position_warnings
+from skyquilt.alignment.contradicted_positions import enlargement_warnings, position_warnings
 from tests.alignment.surveys import alignment, prior
 
 LINES = np.array([(20.0 * (i % 5), 30.0 * (i // 5), 60.0) for i in range(20)])
@@ -69,3 +69,28 @@ def test_a_block_that_lies_elsewhere_than_its_positions(degrees, scale):
 def test_nothing_is_said_of_few_photos_or_of_a_map_without_place():
     assert position_warnings(told_at(mirrored(LINES))[:5], block(LINES[:5])) == []
     assert position_warnings(told_at(mirrored(LINES)), block(crs=None)) == []
+
+
+@pytest.mark.parametrize("factors", [(1.0, 1.5), (1.0, 1.25, 1.6), (1.0, 1.15)])
+@pytest.mark.parametrize("datum", [0.0, 140.0])
+def test_photos_that_are_enlarged_by_other_factors_are_told(factors, datum):
+    each = np.resize(factors, len(LINES))
+    seen = np.column_stack([LINES[:, :2], LINES[:, 2] / each])
+    noise = np.random.default_rng(2).normal(0, 0.3, len(LINES))
+    places = LINES + np.column_stack([np.zeros((20, 2)), noise + datum])
+    (told,) = enlargement_warnings(told_at(places), block(seen))
+    assert "zoom" in told and "DigitalZoomRatio" in told
+    number = int(told.split()[0])
+    assert number in [int((each >= f).sum()) for f in factors[1:]]
+
+
+def test_heights_that_are_told_drift_or_are_few_are_no_zoom():
+    drift = np.column_stack([np.zeros((20, 2)), np.linspace(0, 20, 20)])
+    two = LINES + np.column_stack([np.zeros((20, 2)), np.resize([0, 60], 20)])
+    wrong = LINES.copy()
+    wrong[:2, 2] += 40
+    assert enlargement_warnings(told_at(LINES + drift), block()) == []
+    assert enlargement_warnings(told_at(two), block(two * (1, 1, 1.3))) == []
+    assert enlargement_warnings(told_at(wrong), block()) == []
+    assert enlargement_warnings(told_at(two), block(two)) == []
+    assert enlargement_warnings(told_at(LINES * (1, 1, np.nan)), block()) == []

@@ -1,10 +1,12 @@
 """Photos that no link connects with the others are looked at again, with more features."""
 
+import shutil
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from PIL import Image, ImageOps
 
 from skyquilt.model.features import Features, Link, RejectedLink
 from skyquilt.settings import MosaicSettings
@@ -14,6 +16,7 @@ from skyquilt.workflows.methods import methods_for
 from skyquilt.workflows.mosaic import mosaic
 from skyquilt.workflows.second_look import TRIED, _numbers, unconnected
 from tests.alignment.surveys import prior
+from tests.texture import texture
 
 
 def link(a, b):
@@ -85,3 +88,36 @@ def test_photos_with_few_features_are_connected(flight, tmp_path, monkeypatch, l
     metrics = mosaic(flight / "photos", tmp_path / "out", settings, methods=few).metrics
     assert (metrics["blocks"] == [9]) == (looks == 2)
     assert metrics["reprojection_error_px"]["mean"] < 0.5
+
+
+def other_ground(picture):
+    """Unrelated texture: such photos are linked with none, whatever is done to them."""
+    return Image.fromarray(
+        np.clip(texture(picture.height, picture.width, seed=5), 0, 255).astype(np.uint8)
+    ).convert("RGB")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (ImageOps.mirror, "mirrored"),
+        (ImageOps.flip, "mirrored"),
+        (ImageOps.invert, "in negative"),
+        (other_ground, None),
+    ],
+)
+def test_photos_that_are_mirrored_or_in_negative_are_told(flight, tmp_path, change, said):
+    """Every second photo is changed by Pillow; the others are as they were."""
+    folder = tmp_path / "photos"
+    shutil.copytree(flight / "photos", folder)
+    for path in sorted(folder.glob("*.jpg"))[::2]:
+        with Image.open(path) as picture:
+            exif = picture.getexif().tobytes()
+            changed = change(picture.convert("RGB"))
+        changed.save(path, quality=92, exif=exif)
+    settings = MosaicSettings(surface="ties", gsd_cm=40.0)
+    warnings = mosaic(folder, tmp_path / "out", settings).metrics["warnings"]
+    told = [w for w in warnings if "against others" in w]
+    assert len(told) == (said is not None)
+    assert all(f"the ground {said} against" in w for w in told)

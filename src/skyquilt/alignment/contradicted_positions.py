@@ -1,5 +1,6 @@
 """Whether reported positions contradict the pictures as a whole, so that a map's place, scale and
-direction are not reliable: `conflicts` tells of single ones.
+direction are not reliable: `conflicts` tells of single ones. And whether photos of one camera are
+enlarged by other factors than their metadata tell.
 """
 
 from collections.abc import Sequence
@@ -20,6 +21,16 @@ CONTRADICTED_SHARE = 0.03
 MIRRORED = 0.3
 """Positions are mirrored where their mirror image misfits by less than this share of their own
 misfit.
+"""
+ENLARGED = 1.1
+"""Photos of one camera are enlarged differently where their heights by image scale, over those that
+they report, fall into groups at least this factor apart,
+"""
+FEWEST_ENLARGED = 3
+"""each of at least so many photos: a single false height is told by `conflicts`."""
+ALIKE = 0.1
+"""Compared are photos that report the same height within this share of it: between others, a false
+focal length alone makes such factors.
 """
 
 
@@ -51,6 +62,45 @@ def position_warnings(priors: Sequence[Prior], alignment: Alignment) -> list[str
         " of the map rest on them and are not reliable; correct the positions with a geo.txt, or"
         " give control points."
     ]
+
+
+def enlargement_warnings(priors: Sequence[Prior], alignment: Alignment) -> list[str]:
+    """A sentence for each camera whose photos show the ground at scales that their reported heights
+    do not explain: a digital zoom or a crop looks like a lower flight, but relief does not.
+
+    Heights that drift have no gaps, and an offset of all heights is none.
+    """
+    if alignment.frame.crs is None or not len(alignment.ties.xyz):
+        return []
+    ground = float(np.median(alignment.ties.xyz[:, 2]))
+    told = {i: priors[i].map_C[2] for i in alignment.held if np.isfinite(priors[i].map_C[2])}
+    if not told:
+        return []
+    shift = float(np.median([alignment.poses[i].map_C[2] - z for i, z in told.items()]))
+    out = list[str]()
+    for key in dict.fromkeys(alignment.camera_of[i] for i in told):
+        pairs = [
+            (alignment.poses[i].map_C[2] - ground, z + shift - ground)
+            for i, z in told.items()
+            if alignment.camera_of[i] == key
+        ]
+        usual = float(np.median([r for _, r in pairs]))
+        ratio = np.sort([h / r for h, r in pairs if h > 0 and abs(r - usual) < ALIKE * usual])
+        near, gap = ratio[FEWEST_ENLARGED - 1 : 1 - FEWEST_ENLARGED], 0.0
+        if len(near) > 1:
+            steps = near[1:] / near[:-1]
+            at, gap = int(np.argmax(steps)), float(steps.max())
+        if gap >= ENLARGED:
+            first = at + FEWEST_ENLARGED
+            factor = float(np.median(ratio[first:]) / np.median(ratio[:first]))
+            out.append(
+                f"{first} of {len(ratio)} photos of {key} show the ground {factor:.2f} times as"
+                " large as the others, and their reported heights do not tell why: a digital zoom"
+                " or a crop that their metadata do not state, or heights that are wrong. A zoom"
+                " bends the map where the ground is not level; write it into the photos (EXIF"
+                " DigitalZoomRatio), or map the photos of each zoom by themselves."
+            )
+    return out
 
 
 def _mirrored(

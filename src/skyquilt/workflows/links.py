@@ -80,11 +80,13 @@ class Links:
     """Where the keypoints of all links lie."""
     lenses: tuple[str, ...] = ()
     """Notes on lenses whose kind was found by them."""
+    changed: tuple[str, ...] = ()
+    """Notes on photos that are mirrored or in negative against others."""
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What a user should know."""
-        return (*self.marks.notes, *self.lenses)
+        return (*self.marks.notes, *self.lenses, *self.changed)
 
     def make_room(self) -> None:
         """Gives back the memory of matches that were used."""

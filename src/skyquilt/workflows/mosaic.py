@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from skyquilt.alignment.conflicts import conflicts
-from skyquilt.alignment.contradicted_positions import position_warnings
+from skyquilt.alignment.contradicted_positions import enlargement_warnings, position_warnings
 from skyquilt.alignment.heights import height_figures
 from skyquilt.alignment.oblique_start import tilt_warnings
 from skyquilt.engine.clock import Clock, Steps, result_of
@@ -386,6 +386,7 @@ def _metrics(
             warnings=[
                 *aligned.links.notes,
                 *position_warnings(aligned.priors, alignment),
+                *enlargement_warnings(aligned.priors, alignment),
                 *tilt_warnings(aligned.priors, alignment),
             ],
             notes=[*survey.notes, *alignment.notes],

@@ -2,12 +2,15 @@
 
 Forests, crops and water have few features that are alike in two photos, and the strongest ones of a
 photo are rarely those of its neighbour. Among five times as many there mostly are enough; to look
-for so many in all photos would be a waste.
+for so many in all photos would be a waste. Where these connect nothing either, a few pairs are
+compared with one photo mirrored or in negative, and a note names it where that is why.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,6 +35,23 @@ TRIED = 6
 """Pairs that are compared again for each of these photos."""
 SAME_PX = 0.5
 """Features closer to one another than this, in px of the image that is searched, are the same."""
+CHANGED_TRIED = 6
+"""Pairs, each with another photo outside the largest block, of which one photo is changed."""
+CHANGED_LINKS = 2
+"""Pairs that must be linked then, for a note."""
+CHANGED: dict[str, Callable[[NDArray[Any]], NDArray[Any]]] = {
+    "mirrored": lambda grey: cv2.flip(grey, 1),
+    "in negative": cv2.bitwise_not,
+}
+"""What programs and cameras do to some photos of a survey, and features do not survive; each undoes
+itself.
+"""
+CAUSES = {
+    "mirrored": "a program or a camera setting has mirrored some of them; mirror these back",
+    "in negative": "some of them are negatives, or their thermal palette was reversed (white hot,"
+    " black hot); invert these",
+}
+"""What a user is told to do."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -59,6 +79,24 @@ class CloserLook:
             return detector.of_shrunken(small, (one.height, one.width))
 
         return self.store.get_or("features", key, found)
+
+    def changed(self, pair: Pair, how: str, first: Features) -> bool:
+        """Whether two photos are linked where the second one is changed; `first`: usual features of
+        the first.
+        """
+        a, b = pair
+        detector, two = self.methods.detector, (self.photos[a], self.photos[b])
+        names = seen_as(two[0]), seen_as(two[1])
+        recipe = features_recipe(detector), self.methods.matcher, self.methods.verify
+
+        def compared() -> list[bool]:
+            small, _ = shrink(self.grey(b, PICTURE), detector.longest)
+            shown = np.ascontiguousarray(CHANGED[how](small))
+            second = detector.of_shrunken(shown, (two[1].height, two[1].width))
+            return [isinstance(link_pair(a, b, (first, second), two, self.methods), Link)]
+
+        key = digest(names, how, CHANGED_LINKS, recipe)
+        return bool(self.store.get_or("links", key, compared)[0])
 
     def prepare(self, photo: int) -> None:
         """Finds the features of a photo (index), so that its pairs need not."""
@@ -107,6 +145,9 @@ def connect(
         yield len(photos) + done + 1, total
         if isinstance(link, Link):
             better.append(link)
+    still = set(pairs) - {(k.a, k.b) for k in better}
+    said = changed_notes(sorted(still), replace(look, methods=methods), found)
+    links = replace(links, changed=said) if said else links
     if not better:
         return found, links
     again = frozenset(i for k in better for i in (k.a, k.b))
@@ -121,6 +162,36 @@ def connect(
     rest = tuple(k for k in links.rejected if (k.a, k.b) not in joined)
     linked = replace(links, links=tuple(whole), rejected=rest)
     return replace(found, closer=look, again=again), linked
+
+
+def changed_notes(
+    failed: Sequence[Pair], look: CloserLook, found: FeaturedPhotos
+) -> tuple[str, ...]:
+    """What keeps pairs from being linked that are linked with one photo changed: one note at most
+    for each of `CHANGED`. Pairs of photos with marks tell nothing, since marks are linked with
+    themselves.
+    """
+    tried, seen = list[Pair](), set[int]()
+    for pair in failed:
+        cameras = {found.photos[i].camera_key for i in pair}
+        if seen.isdisjoint(pair) and cameras.isdisjoint(look.marks.masks):
+            tried.append(pair)
+            seen.update(pair)
+    tried = (
+        [tried[k] for k in np.unique(np.linspace(0, len(tried) - 1, CHANGED_TRIED, dtype=int))]
+        if tried
+        else []
+    )
+    out = list[str]()
+    for how, cause in CAUSES.items():
+        linked = [k for k in tried if look.changed(k, how, found.features[k[0]])]
+        if len(linked) >= CHANGED_LINKS:
+            a, b = (found.photos[i].name for i in linked[0])
+            out.append(
+                f"Some photos show the ground {how} against others, and these do not connect, such"
+                f" as {a} and {b}: {cause}, or map them by themselves."
+            )
+    return tuple(out)
 
 
 def unconnected(count: int, links: Links, priors: Sequence[Prior]) -> list[Pair]:
