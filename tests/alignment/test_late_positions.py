@@ -1,4 +1,4 @@
-"""Positions of the photo before or after are moved to where they belong, and no others are."""
+"""Positions of photos before or after are moved to where they belong, and no others are."""
 
 from dataclasses import replace
 
@@ -40,15 +40,45 @@ def told_at(places, sigma, seed):
     return [prior(C, sigma=sigma) for C in places + noise]
 
 
-@pytest.mark.parametrize("late", [1, -1])
+@pytest.mark.parametrize("late", [1, -1, 3, -5])
+@pytest.mark.parametrize("sigma", [1.5, 5.0])
 @pytest.mark.parametrize("seed", range(4))
-def test_late_positions_are_moved(late, seed):
-    true = told_at(LINES, 1.5, seed)
+def test_late_positions_are_moved(late, sigma, seed):
+    """By however many photos, and whatever is stated of their deviations."""
+    true = [replace(p, sigma_C=np.full(3, sigma)) for p in told_at(LINES, 1.5, seed)]
     moved = unshifted(block(LINES), late_by(true, late), ["A"] * len(LINES))
-    inside = slice(None, -1) if late > 0 else slice(1, None)
+    inside = slice(None, -late) if late > 0 else slice(-late, None)
     for a, b in zip(moved[inside], true[inside], strict=True):
         assert np.array_equal(a.map_C, b.map_C)
-    assert np.isnan(moved[-1 if late > 0 else 0].map_C).all()
+    outside = moved[-late:] if late > 0 else moved[:-late]
+    assert all(np.isnan(p.map_C).all() for p in outside)
+
+
+@pytest.mark.parametrize("at", [4, 9, 12])
+@pytest.mark.parametrize("seed", range(4))
+def test_from_a_missing_line_of_a_list_on_positions_are_moved(at, seed):
+    """Up to one photo next to the line belongs to either side."""
+    true = told_at(LINES, 1.5, seed)
+    right = np.array([p.map_C for p in true])
+    lists = ([*true[:at], *true[at + 1 :], true[-1]], [*true[:at], true[at], *true[at:-1]])
+    for told in lists:
+        moved = unshifted(block(LINES), told, ["A"] * len(LINES))
+        off = np.linalg.norm([p.map_C - C for p, C in zip(moved, right, strict=True)], axis=1)
+        before = np.linalg.norm([p.map_C - C for p, C in zip(told, right, strict=True)], axis=1)
+        assert (before > 10).sum() >= 11
+        assert (off > 1e-9).sum() <= 3  # NaN, where none is left, is not
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_receivers_that_drift_and_flights_displaced_against_each_other_move_nothing(seed):
+    rng = np.random.default_rng(seed)
+    drift = np.cumsum(rng.normal(0, 1.5, LINES.shape), axis=0)
+    parts = np.where(np.arange(len(LINES))[:, None] < 12, [0.0, 0, 0], [18.0, 0, 0])
+    last = np.where(np.arange(len(LINES))[:, None] < 18, [0.0, 0, 0], [-18.0, 0, 0])
+    for error in (drift, parts, last):
+        noise = rng.normal(0, 1.0, LINES.shape)
+        priors = [prior(C, sigma=1.5) for C in LINES + error + noise]
+        assert unshifted(block(LINES), priors, ["A"] * len(LINES)) is priors
 
 
 @pytest.mark.parametrize("sigma", [0.02, 1.5, 5.0, 15.0])
@@ -101,5 +131,5 @@ def test_a_flight_with_late_positions_is_placed_as_with_right_ones(seed):
     assert len(late.poses) == len(LINES)
     # one position of 24 is missing, and GPS errs by 1.5 m
     assert np.linalg.norm(off, axis=1).max() < 1.0
-    assert sum("moved by one photo" in note for note in late.notes) == 1
-    assert not any("moved by one photo" in note for note in right.notes)
+    assert sum("moved to the photos" in note for note in late.notes) == 1
+    assert not any("moved to the photos" in note for note in right.notes)

@@ -1,8 +1,8 @@
-"""Positions that belong to the photo before or after: a logger that is one photo late, or a list
-of positions in which one line is missing or too many.
+"""Positions that belong to other photos: a logger that is late, photos of the ground before the
+flight that a list of positions counts or leaves out, a line that is missing in it or too many.
 
 Along a line such positions look right, and where a drone turns they do not; so they bend and shrink
-a map that they hold in place.
+a map that they hold in place. From a missing line on, all that follow are shifted.
 """
 
 from collections.abc import Sequence
@@ -14,61 +14,150 @@ from numpy.typing import NDArray
 from skyquilt.alignment.similarity_graph import fit_similarity
 from skyquilt.model.poses import Alignment, Prior
 
-FEWEST = 10
-"""Photos of a camera with positions that tell whether these are late."""
-CLEARER = 0.6
-"""Moved by a photo, positions misfit by less than this share of what they misfit by before, ..."""
-OFF = 1.5
-"""... which is more than this times their deviations."""
+FEWEST, FEWEST_PART = 10, 8
+"""Photos of a camera with positions that tell whether these are shifted, and of a part of them."""
+MOST = 6
+"""Positions are sought so many photos before and after at most."""
+CLEARER = 0.5
+"""Shifted, positions misfit by less than this share of what they misfit by before, displaced as
+fits best, and of what the nearest other shifts leave.
+"""
+CHANGE = 4.0
+"""A part with another shift begins where that explains so many positions that nothing else does."""
+OUTLIER = 3.0
+"""A position that misfits by more than this times the usual misfit is not explained."""
+
+MOVED = "They were moved to the photos that they belong to."
+"""Words of the note by which an alignment tells that it did so."""
+
+Complex = NDArray[np.complex128]
+Floats = NDArray[np.float64]
+Shifts = NDArray[np.int64]
 
 
 def unshifted(found: Alignment, priors: Sequence[Prior], cameras: Sequence[str]) -> Sequence[Prior]:
-    """The priors with positions of each camera's photos moved to the photo before or after, in
-    order of capture, where they then fit the pictures far better; photos for which none is left
-    have none. `cameras`: that of each photo. The very same priors where none is moved.
+    """The priors with positions of each camera's photos moved to photos before or after, in order
+    of capture, where they then fit the pictures far better; photos for which none is left have
+    none. `cameras`: that of each photo. The very same priors where none is moved.
     """
     out = list(priors)
     for camera in dict.fromkeys(cameras):
         own = [i for i, c in enumerate(cameras) if c == camera]
-        now = _misfit(found, priors, own, 0)
-        sigma = [priors[i].sigma_C[0] for i in own if np.isfinite(priors[i].map_C[0])]
-        if now is None or not now > OFF * float(np.median(sigma)):
-            continue
-        for late in (1, -1):
-            moved = _misfit(found, priors, own, late)
-            if moved is not None and moved < CLEARER * now:
-                for k, i in enumerate(own):
-                    inside = 0 <= k + late < len(own)
-                    out[i] = _at(priors[i], priors[own[k + late]] if inside else None)
+        for k, late in enumerate(_shifts(found, priors, own).tolist()):
+            if late:
+                source = priors[own[k + late]] if 0 <= k + late < len(own) else None
+                out[own[k]] = _at(priors[own[k]], source)
     return out if any(a is not b for a, b in zip(out, priors, strict=True)) else priors
+
+
+def as_moved(found: Alignment, priors: Sequence[Prior], cameras: Sequence[str]) -> Sequence[Prior]:
+    """The priors as an alignment took them: moved where it says so."""
+    told = any(MOVED in note for note in found.notes)
+    return unshifted(found, priors, cameras) if told else priors
 
 
 def moved_note(before: Sequence[Prior], after: Sequence[Prior]) -> str:
     """What is said of priors whose positions were moved."""
     number = sum(a is not b for a, b in zip(after, before, strict=True))
     return (
-        f"The positions of {number} photos belong to the photo before or after each: the pictures"
-        " show it. They were moved by one photo. Check the list or the logger that they come from."
+        f"The positions of {number} photos belong to photos before or after them, in order of"
+        f" capture: the pictures show it. {MOVED} Check the list or the logger that they come from."
     )
 
 
-def _misfit(
-    found: Alignment, priors: Sequence[Prior], own: Sequence[int], late: int
-) -> float | None:
-    """Median distance in m between photos as placed, brought to their positions by a similarity,
-    and the positions of the photos `late` places after them; None where too few have both.
+def _shifts(found: Alignment, priors: Sequence[Prior], own: Sequence[int]) -> Shifts:
+    """How many photos after each its position stands, 0 where nothing tells; (n,)."""
+    nowhere = complex(np.nan, np.nan)
+    placed = np.array(
+        [complex(*found.poses[i].map_C[:2]) if i in found.poses else nowhere for i in own]
+    )
+    told = np.array([complex(*priors[i].map_C[:2]) for i in own])
+    sigma = np.array([priors[i].sigma_C[0] for i in own])
+    fits = {s: f for s in range(-MOST, MOST + 1) if (f := _fit(placed, told, sigma, s)) is not None}
+    if not fits:
+        return np.zeros(len(own), np.int64)
+    usual = max(min(f[2] for f in fits.values()), 1e-3)
+    best, least = np.zeros(len(own), np.int64), np.inf
+    for g, c, _ in sorted(fits.values(), key=lambda f: f[2])[:3]:
+        off = _misfits(g * placed + c, told)
+        path, cost = _path(np.minimum((off / (OUTLIER * usual)) ** 2, 1.0))
+        if cost < least:
+            best, least = _clear(path, g * placed + c, told), cost
+    return best
+
+
+def _fit(
+    placed: Complex, told: Complex, sigma: Floats, shift: int
+) -> tuple[complex, complex, float] | None:
+    """The similarity from photos to the positions `shift` places after them, and its misfit in m;
+    None where too few have both.
     """
-    pairs = [
-        (i, j)
-        for i, j in zip(own[max(0, -late) :], own[max(0, late) :], strict=False)
-        if i in found.poses and np.isfinite(priors[j].map_C[:2]).all()
-    ]
-    if len(pairs) < FEWEST:
+    moved, deviation = _moved(told, shift), _moved(sigma, shift)
+    both = np.isfinite(placed) & np.isfinite(moved)
+    if both.sum() < FEWEST:
         return None
-    placed = _plane([found.poses[i].map_C for i, _ in pairs])
-    told = _plane([priors[j].map_C for _, j in pairs])
-    sigma = np.array([priors[j].sigma_C[0] for _, j in pairs])
-    return fit_similarity(placed, told, sigma)[2]
+    return fit_similarity(placed[both], moved[both], deviation[both].real)
+
+
+def _misfits(placed: Complex, told: Complex) -> Floats:
+    """Distances in m (2 MOST + 1, n) of photos from positions -MOST ... MOST places after them."""
+    return np.array([np.abs(_moved(told, s) - placed) for s in range(-MOST, MOST + 1)])
+
+
+def _moved(values: NDArray[np.inexact], shift: int) -> Complex:
+    """Each photo's value is that `shift` places after it; NaN beyond the ends."""
+    out = np.full(len(values), complex(np.nan, np.nan))
+    inside = slice(max(0, -shift), len(values) - max(0, shift))
+    out[inside] = values[max(0, shift) : len(values) + min(0, shift)]
+    return out
+
+
+def _path(cost: Floats) -> tuple[Shifts, float]:
+    """The shift of each photo, of which the sum of costs and of `CHANGE` for each change, and for
+    not beginning with none, is least (Viterbi). `cost` (2 MOST + 1, n); unknown ones are 1.
+    """
+    cost = np.nan_to_num(cost, nan=1.0)
+    total = cost[:, 0] + CHANGE * (np.arange(len(cost)) != MOST)
+    came = np.zeros(cost.shape, np.int64)
+    for k in range(1, cost.shape[1]):
+        cheapest = int(np.argmin(total))
+        jump = total > total[cheapest] + CHANGE
+        came[:, k] = np.where(jump, cheapest, np.arange(len(cost)))
+        total = np.where(jump, total[cheapest] + CHANGE, total) + cost[:, k]
+    at = int(np.argmin(total))
+    path = np.zeros(cost.shape[1], np.int64)
+    for k in range(cost.shape[1] - 1, -1, -1):
+        path[k] = at - MOST
+        at = int(came[at, k])
+    return path, float(total.min())
+
+
+def _clear(path: Shifts, placed: Complex, told: Complex) -> Shifts:
+    """The path without shifts of parts that a displacement of the part, or the next shift of all,
+    explains nearly as well: positions along one straight line tell no shift.
+    """
+    out = path.copy()
+    for part in np.split(np.arange(len(path)), np.flatnonzero(np.diff(path)) + 1):
+        shift = int(path[part[0]])
+        if not shift:
+            continue
+        now = _own_misfit(placed, told, part, shift)
+        others = [_own_misfit(placed, told, part, s) for s in (0, shift - 1, shift + 1)]
+        if now is None or any(m is not None and not now < CLEARER * m for m in others):
+            out[part] = 0
+    return out
+
+
+def _own_misfit(placed: Complex, told: Complex, part: Shifts, shift: int) -> float | None:
+    """Mean distance in m of a part's photos from their shifted positions, displaced as fits best,
+    of the three quarters that fit best; None where too few have both.
+    """
+    off = (_moved(told, shift) - placed)[part]
+    off = off[np.isfinite(off)]
+    if len(off) < FEWEST_PART:
+        return None
+    off = np.abs(off - complex(np.median(off.real), np.median(off.imag)))
+    return float(np.sort(off)[: -(-3 * len(off) // 4)].mean())
 
 
 def _at(prior: Prior, other: Prior | None) -> Prior:
@@ -76,7 +165,3 @@ def _at(prior: Prior, other: Prior | None) -> Prior:
     if other is None:
         return replace(prior, map_C=np.full(3, np.nan))
     return replace(prior, map_C=other.map_C, sigma_C=other.sigma_C)
-
-
-def _plane(places: Sequence[NDArray[np.float64]]) -> NDArray[np.complex128]:
-    return np.array([complex(C[0], C[1]) for C in places])
