@@ -110,6 +110,19 @@ def test_a_straight_line_tells_nothing():
     assert unshifted(block(line), priors, ["A"] * len(line)) is priors
 
 
+@pytest.mark.parametrize("turn", [0, 18, 90])
+def test_a_circle_tells_nothing(turn):
+    """Moved by a photo, the positions of an orbit are those of an orbit that is turned."""
+    b = np.radians(np.arange(20) * 18.0)
+    around = np.column_stack([47 * np.sin(b), 47 * np.cos(b), np.full(20, 40.0)])
+    found = np.column_stack(
+        [*(47 * f(b + np.radians(turn)) for f in (np.sin, np.cos)), around[:, 2]]
+    )
+    for seed in range(4):
+        priors = told_at(around, 1.5, seed)
+        assert unshifted(block(found), priors, ["A"] * 20) is priors
+
+
 def test_each_camera_has_its_own_order():
     """Two cameras expose together, so the photo before is that of the other one."""
     both = np.repeat(LINES, 2, axis=0)

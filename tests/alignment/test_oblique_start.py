@@ -224,3 +224,33 @@ def test_what_photos_report_is_kept_where_no_guess_is_clearly_better():
         assert guessed_priors(flown.photos, flown.priors, flown.features, flown.links) is None
     nowhere = [prior((np.nan,) * 3, pitch=50) for _ in flown.priors]
     assert guessed_priors(flown.photos, nowhere, flown.features, flown.links) is None
+
+
+@pytest.mark.parametrize(("share", "taken"), [(3, False), (1, True)])
+def test_a_guess_that_leaves_the_pictures_for_the_positions_is_not_taken(monkeypatch, share, taken):
+    """Mirrored or garbled positions suggest directions with which some matched rays meet: photos
+    then come nearer to the positions and keep a third of their observations.
+    """
+    flown = Slanting([(18.0 * k, 25.0 * j, 60.0, 0.0, 0.0) for j in range(3) for k in range(5)])
+    whole, begun = flown.aligned(), []
+    some = slice(None, None, share)
+    ties = replace(
+        whole.ties,
+        point=whole.ties.point[some],
+        photo=whole.ties.photo[some],
+        px=whole.ties.px[some],
+        residual_px=whole.ties.residual_px[some],
+    )
+    near = {i: replace(p, map_C=flown.priors[i].map_C) for i, p in whole.poses.items()}
+
+    def block(self, *given):
+        begun.append(given)
+        return whole if len(begun) == 1 else replace(whole, poses=near, ties=ties)
+
+    monkeypatch.setattr(Bundle, "_block", block)
+    monkeypatch.setattr("skyquilt.alignment.bundle.misled", lambda *given: True)
+    monkeypatch.setattr("skyquilt.alignment.bundle.guessed_priors", lambda *given: flown.priors)
+    found = flown.aligned()
+    assert len(begun) == 2
+    chosen = near if taken else whole.poses
+    assert all(np.array_equal(found.poses[i].map_C, chosen[i].map_C) for i in chosen)

@@ -134,6 +134,24 @@ def test_a_photo_300_km_away_loses_its_position_but_stays(make_jpeg):
     assert sum(p.position is not None for p in survey.photos) == 6
 
 
+@pytest.mark.parametrize(
+    ("degrees", "why", "metres"),
+    [((5_160_000, 445_000), "5.16e+06", True), ((0, 0), "without a satellite fix", False)],
+)
+def test_a_survey_says_why_stated_positions_are_none(make_jpeg, degrees, why, metres):
+    folder = flight(make_jpeg, 3)
+    for i in range(2):
+        exif = dji_exif()
+        for key, value in zip(("GPSLatitude", "GPSLongitude"), degrees, strict=True):
+            exif["GPS"][getattr(piexif.GPSIFD, key)] = ((value, 1), (0, 1), (0, 1))
+        make_jpeg(f"none{i}.jpg", exif=exif, seed=50 + i)
+    survey = read_survey(folder)
+    assert sum(p.position is None for p in survey.photos) == 2
+    (told,) = [n for n in survey.notes if "state a position that is none" in n]
+    assert told.startswith("2 photos") and why in told
+    assert ("geo.txt" in told) == metres
+
+
 def test_two_cameras_and_mixed_clocks_are_named(make_jpeg):
     folder = flight(make_jpeg, 3)
     make_jpeg(

@@ -15,7 +15,7 @@ from skyquilt.alignment.equations import NearFactor
 from skyquilt.alignment.late_positions import moved_note, unshifted
 from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
 from skyquilt.alignment.oblique import found_oblique, hung, reported_oblique, tilts_reported
-from skyquilt.alignment.oblique_guess import LOWERED, guessed_priors, lowered, misled
+from skyquilt.alignment.oblique_guess import LOWERED, agrees, guessed_priors, lowered, misled
 from skyquilt.alignment.oblique_start import (
     nearer,
     off_positions,
@@ -74,7 +74,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 44
+    version: ClassVar[int] = 46
 
     def __call__(
         self,
@@ -131,7 +131,7 @@ class Bundle:
             guess = guessed_priors(photos, priors, features, links)
             if guess is not None:
                 other = block(untold(guess), guess, "guessed ")
-                if nearer(other, found, priors):
+                if nearer(other, found, priors) and agrees(other, found):
                     found, aside, guessed = other, untold(guess), True
         for again in range(BEGUN_AGAIN) if self.repair else ():
             if (turned := turned_priors(found, priors)) is None:

@@ -19,8 +19,8 @@ FEWEST, FEWEST_PART = 10, 8
 MOST = 6
 """Positions are sought so many photos before and after at most."""
 CLEARER = 0.5
-"""Shifted, positions misfit by less than this share of what they misfit by before, displaced as
-fits best, and of what the nearest other shifts leave.
+"""Shifted, positions of a part misfit by less than this share of what they misfit by before, and of
+what the nearest other shifts leave, each with the place, direction and scale that fit best.
 """
 CHANGE = 4.0
 """A part with another shift begins where that explains so many positions that nothing else does."""
@@ -78,12 +78,13 @@ def _shifts(found: Alignment, priors: Sequence[Prior], own: Sequence[int]) -> Sh
         return np.zeros(len(own), np.int64)
     usual = max(min(f[2] for f in fits.values()), 1e-3)
     best, least = np.zeros(len(own), np.int64), np.inf
-    for g, c, _ in sorted(fits.values(), key=lambda f: f[2])[:3]:
+    likely = sorted(fits, key=lambda s: (s != 0, fits[s][2]))[:4]  # as they are, and three others
+    for g, c, _ in (fits[s] for s in likely):
         off = _misfits(g * placed + c, told)
         path, cost = _path(np.minimum((off / (OUTLIER * usual)) ** 2, 1.0))
         if cost < least:
-            best, least = _clear(path, g * placed + c, told), cost
-    return best
+            best, least = path, cost
+    return _clear(best, placed, told, sigma)
 
 
 def _fit(
@@ -132,32 +133,35 @@ def _path(cost: Floats) -> tuple[Shifts, float]:
     return path, float(total.min())
 
 
-def _clear(path: Shifts, placed: Complex, told: Complex) -> Shifts:
-    """The path without shifts of parts that a displacement of the part, or the next shift of all,
-    explains nearly as well: positions along one straight line tell no shift.
+def _clear(path: Shifts, placed: Complex, told: Complex, sigma: Floats) -> Shifts:
+    """The path without shifts of parts that another place, direction and scale of the part, or the
+    next shift, explains nearly as well: positions along one straight line or a circle tell none.
     """
     out = path.copy()
     for part in np.split(np.arange(len(path)), np.flatnonzero(np.diff(path)) + 1):
         shift = int(path[part[0]])
         if not shift:
             continue
-        now = _own_misfit(placed, told, part, shift)
-        others = [_own_misfit(placed, told, part, s) for s in (0, shift - 1, shift + 1)]
+        now, *others = (
+            _own_misfit(placed[part], _moved(told, s)[part], sigma[part])
+            for s in (shift, 0, shift - 1, shift + 1)
+        )
         if now is None or any(m is not None and not now < CLEARER * m for m in others):
             out[part] = 0
     return out
 
 
-def _own_misfit(placed: Complex, told: Complex, part: Shifts, shift: int) -> float | None:
-    """Mean distance in m of a part's photos from their shifted positions, displaced as fits best,
-    of the three quarters that fit best; None where too few have both.
+def _own_misfit(placed: Complex, told: Complex, sigma: Floats) -> float | None:
+    """Mean distance in m of a part's photos, brought to positions by a similarity of their own,
+    from these, of the three quarters that fit best; None where too few have both.
     """
-    off = (_moved(told, shift) - placed)[part]
-    off = off[np.isfinite(off)]
-    if len(off) < FEWEST_PART:
+    both = np.isfinite(placed) & np.isfinite(told)
+    if both.sum() < FEWEST_PART:
         return None
-    off = np.abs(off - complex(np.median(off.real), np.median(off.imag)))
-    return float(np.sort(off)[: -(-3 * len(off) // 4)].mean())
+    placed, told = placed[both], told[both]
+    g, c, _ = fit_similarity(placed, told, sigma[both])
+    off = np.sort(np.abs(g * placed + c - told))
+    return float(off[: -(-3 * len(off) // 4)].mean())
 
 
 def _at(prior: Prior, other: Prior | None) -> Prior:

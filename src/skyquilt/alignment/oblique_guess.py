@@ -27,6 +27,10 @@ in space (median; two thirds are usual) may have been begun wrongly;
 """
 LOST = 0.2
 """so may one that lost more than this share of its linked photos."""
+AGREES = 0.7
+"""An adjustment by a guess that keeps less than this share of the observations of the one before
+contradicts the pictures, however near to their positions its photos come.
+"""
 MATCHES, LOOKED_AT = 40, 20_000
 """Matches of a link, and of all, that are looked at, about."""
 FAR = 4.0
@@ -69,6 +73,13 @@ def misled(found: Alignment, priors: Sequence[Prior], linked: int) -> bool:
     sigma = np.median([float(np.linalg.norm(priors[i].sigma_C)) for i in found.held] or [np.inf])
     off = off_positions(found, priors) > OFF * sigma
     return bool(off or turned_far(found, priors) or len(found.held) < (1 - LOST) * linked)
+
+
+def agrees(guessed: Alignment, found: Alignment) -> bool:
+    """Whether an adjustment by a guess keeps enough of the observations of the one before: false
+    positions find directions, too, with which some rays meet.
+    """
+    return len(guessed.ties.photo) >= AGREES * len(found.ties.photo)
 
 
 def guessed_priors(

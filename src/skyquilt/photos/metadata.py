@@ -26,6 +26,8 @@ NO_HEMISPHERE = (
     " and east are assumed."
 )
 """A note of a photo whose GPS position lacks a reference."""
+INVALID = "The GPS position in "
+"""How a note of a photo begins whose GPS position is none."""
 _YEARS = (1980, 2100)
 _RTK_FLOAT, _RTK_FIXED = 34, 50
 _DRONE_SIGMA = (1.5, 3.0)
@@ -84,7 +86,7 @@ def _place(
         return None
     reason = why_void(*pair)
     if reason:
-        notes.append(f"The GPS position in {origin} is invalid: {reason}.")
+        notes.append(f"{INVALID}{origin} is invalid: {reason}.")
         return None
     return pair[0] or 0.0, pair[1] or 0.0
 

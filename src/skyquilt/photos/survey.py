@@ -20,7 +20,7 @@ from skyquilt.photos.implausible_positions import (
     without_stuck,
 )
 from skyquilt.photos.left_out import band_note, without_reduced
-from skyquilt.photos.metadata import NO_HEMISPHERE
+from skyquilt.photos.metadata import INVALID, NO_HEMISPHERE
 from skyquilt.photos.read import ReadPhoto, read_photo
 from skyquilt.photos.recoded import UNNAMED, recoded
 from skyquilt.photos.side_files import apply_positions
@@ -338,6 +338,15 @@ def _gaps(photos: Sequence[Photo]) -> Iterator[str]:
         )
         yield f"{which} a usable GPS position" + (
             f": {sentence_of(void)}." if len(void) < len(photos) else "."
+        )
+    stated = {p.name: n for p in photos if p.position is None for n in p.notes if INVALID in n}
+    if stated:
+        name, note = next(iter(stated.items()))
+        yield f"{len(stated)} photos state a position that is none, such as {name}: {note}" + (
+            " Degrees are expected; positions in metres of a projected system belong in a geo.txt,"
+            " whose first line names the system."
+            if "valid range" in note
+            else ""
         )
     assumed = [p.name for p in photos if NO_HEMISPHERE in p.notes]
     if assumed:
