@@ -147,8 +147,8 @@ def test_a_survey_says_why_stated_positions_are_none(make_jpeg, degrees, why, me
         make_jpeg(f"none{i}.jpg", exif=exif, seed=50 + i)
     survey = read_survey(folder)
     assert sum(p.position is None for p in survey.photos) == 2
-    (told,) = [n for n in survey.notes if "state a position that is none" in n]
-    assert told.startswith("2 photos") and why in told
+    (told,) = [n for n in survey.notes if "state a position that cannot be used" in n]
+    assert told.startswith("2 of 5 photos") and why in told
     assert ("geo.txt" in told) == metres
 
 

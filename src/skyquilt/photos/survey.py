@@ -342,7 +342,8 @@ def _gaps(photos: Sequence[Photo]) -> Iterator[str]:
     stated = {p.name: n for p in photos if p.position is None for n in p.notes if INVALID in n}
     if stated:
         name, note = next(iter(stated.items()))
-        yield f"{len(stated)} photos state a position that is none, such as {name}: {note}" + (
+        number = f"{len(stated)} of {len(photos)} photos"
+        yield f"{number} state a position that cannot be used, such as {name}: {note}" + (
             " Degrees are expected; positions in metres of a projected system belong in a geo.txt,"
             " whose first line names the system."
             if "valid range" in note
