@@ -6,9 +6,8 @@ for so many in all photos would be a waste. Where these connect nothing either, 
 compared with one photo mirrored or in negative, and a note names it where that is why.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -39,19 +38,14 @@ CHANGED_TRIED = 6
 """Pairs, each with another photo outside the largest block, of which one photo is changed."""
 CHANGED_LINKS = 2
 """Pairs that must be linked then, for a note."""
-CHANGED: dict[str, Callable[[NDArray[Any]], NDArray[Any]]] = {
-    "mirrored": lambda grey: cv2.flip(grey, 1),
-    "in negative": cv2.bitwise_not,
-}
-"""What programs and cameras do to some photos of a survey, and features do not survive; each undoes
-itself.
-"""
 CAUSES = {
     "mirrored": "a program or a camera setting has mirrored some of them; mirror these back",
     "in negative": "some of them are negatives, or their thermal palette was reversed (white hot,"
     " black hot); invert these",
 }
-"""What a user is told to do."""
+"""What programs and cameras do to some photos of a survey, and features do not survive; what a user
+is told to do.
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -91,7 +85,7 @@ class CloserLook:
 
         def compared() -> list[bool]:
             small, _ = shrink(self.grey(b, PICTURE), detector.longest)
-            shown = np.ascontiguousarray(CHANGED[how](small))
+            shown = changed_picture(small, how)
             second = detector.of_shrunken(shown, (two[1].height, two[1].width))
             return [isinstance(link_pair(a, b, (first, second), two, self.methods), Link)]
 
@@ -164,11 +158,17 @@ def connect(
     return replace(found, closer=look, again=again), linked
 
 
+def changed_picture(grey: NDArray[np.uint8], how: str) -> NDArray[np.uint8]:
+    """A grey image (h, w) changed in one of the ways of `CAUSES`; twice, it is as it was."""
+    changed = cv2.flip(grey, 1) if how == "mirrored" else cv2.bitwise_not(grey)
+    return np.asarray(changed, np.uint8)
+
+
 def changed_notes(
     failed: Sequence[Pair], look: CloserLook, found: FeaturedPhotos
 ) -> tuple[str, ...]:
     """What keeps pairs from being linked that are linked with one photo changed: one note at most
-    for each of `CHANGED`. Pairs of photos with marks tell nothing, since marks are linked with
+    for each of `CAUSES`. Pairs of photos with marks tell nothing, since marks are linked with
     themselves.
     """
     tried, seen = list[Pair](), set[int]()
