@@ -81,6 +81,13 @@ def test_receivers_that_drift_and_flights_displaced_against_each_other_move_noth
         assert unshifted(block(LINES), priors, ["A"] * len(LINES)) is priors
 
 
+@pytest.mark.parametrize("number", range(1, 14))
+def test_few_photos_move_nothing(number):
+    """Fewer than the largest shift, and fewer than tell of one."""
+    priors = told_at(LINES[:number], 1.5, 1)
+    assert unshifted(block(LINES[:number]), priors, ["A"] * number) is priors
+
+
 @pytest.mark.parametrize("sigma", [0.02, 1.5, 5.0, 15.0])
 @pytest.mark.parametrize("seed", range(4))
 def test_positions_that_are_right_stay(sigma, seed):

@@ -67,6 +67,8 @@ def moved_note(before: Sequence[Prior], after: Sequence[Prior]) -> str:
 
 def _shifts(found: Alignment, priors: Sequence[Prior], own: Sequence[int]) -> Shifts:
     """How many photos after each its position stands, 0 where nothing tells; (n,)."""
+    if len(own) < FEWEST:
+        return np.zeros(len(own), np.int64)
     nowhere = complex(np.nan, np.nan)
     placed = np.array(
         [complex(*found.poses[i].map_C[:2]) if i in found.poses else nowhere for i in own]
@@ -108,8 +110,9 @@ def _misfits(placed: Complex, told: Complex) -> Floats:
 def _moved(values: NDArray[np.inexact], shift: int) -> Complex:
     """Each photo's value is that `shift` places after it; NaN beyond the ends."""
     out = np.full(len(values), complex(np.nan, np.nan))
-    inside = slice(max(0, -shift), len(values) - max(0, shift))
-    out[inside] = values[max(0, shift) : len(values) + min(0, shift)]
+    if abs(shift) < len(values):
+        inside = slice(max(0, -shift), len(values) - max(0, shift))
+        out[inside] = values[max(0, shift) : len(values) + min(0, shift)]
     return out
 
 
