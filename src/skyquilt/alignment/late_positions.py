@@ -67,8 +67,6 @@ def moved_note(before: Sequence[Prior], after: Sequence[Prior]) -> str:
 
 def _shifts(found: Alignment, priors: Sequence[Prior], own: Sequence[int]) -> Shifts:
     """How many photos after each its position stands, 0 where nothing tells; (n,)."""
-    if len(own) < FEWEST:
-        return np.zeros(len(own), np.int64)
     nowhere = complex(np.nan, np.nan)
     placed = np.array(
         [complex(*found.poses[i].map_C[:2]) if i in found.poses else nowhere for i in own]

@@ -26,8 +26,6 @@ from skyquilt.engine.workers import HERE, Workers
 from skyquilt.outside import open_regular
 
 T = TypeVar("T")
-_AS_THEY_ARE = frozenset({type(None), bool, int, float, str})
-"""Types that JSON has, too: most parts of keys are of these, so they are told first."""
 
 
 def digest(*parts: Any) -> str:
@@ -48,8 +46,6 @@ def digest(*parts: Any) -> str:
 
 def _plain(value: Any) -> Any:
     """The value in JSON's types."""
-    if type(value) in _AS_THEY_ARE:
-        return value
     if isinstance(value, type | FunctionType):
         return [_name(value), getattr(value, "version", 0), _constants(value)]
     if dataclasses.is_dataclass(value):
@@ -92,8 +88,6 @@ def _constants(thing: type | FunctionType) -> str:
 
 def _constant(value: Any) -> Any:
     """A constant in JSON's types; code in it (a table of functions) counts by name."""
-    if type(value) in _AS_THEY_ARE:
-        return value
     if isinstance(value, type | FunctionType):
         return {"code": f"{value.__module__}.{value.__qualname__}"}
     if dataclasses.is_dataclass(value):

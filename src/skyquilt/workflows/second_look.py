@@ -140,8 +140,8 @@ def connect(
         if isinstance(link, Link):
             better.append(link)
     still = set(pairs) - {(k.a, k.b) for k in better}
-    said = changed_notes(sorted(still), replace(look, methods=methods), found)
-    links = replace(links, changed=said) if said else links
+    usual = replace(look, methods=methods)
+    links = replace(links, changed=changed_notes(sorted(still), usual, found))
     if not better:
         return found, links
     again = frozenset(i for k in better for i in (k.a, k.b))
@@ -177,11 +177,10 @@ def changed_notes(
         if seen.isdisjoint(pair) and cameras.isdisjoint(look.marks.masks):
             tried.append(pair)
             seen.update(pair)
-    tried = (
-        [tried[k] for k in np.unique(np.linspace(0, len(tried) - 1, CHANGED_TRIED, dtype=int))]
-        if tried
-        else []
-    )
+    if len(tried) < CHANGED_LINKS:
+        return ()  # no note could come of them, and features of changed pictures cost time
+    spread = np.unique(np.linspace(0, len(tried) - 1, CHANGED_TRIED, dtype=int))
+    tried = [tried[k] for k in spread.tolist()]
     out = list[str]()
     for how, cause in CAUSES.items():
         linked = [k for k in tried if look.changed(k, how, found.features[k[0]])]
