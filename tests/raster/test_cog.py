@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from rasterio.enums import MaskFlags
 from scipy.ndimage import distance_transform_edt
@@ -119,6 +119,8 @@ def test_beyond_the_rim_it_fades_without_steps():
 @given(
     st.integers(1, 1500), st.integers(1, 700), st.sampled_from(["jpeg", "deflate"]), st.booleans()
 )
+@example(256, 513, "deflate", False)
+@example(511, 1025, "jpeg", True)
 def test_any_size(tmp_path, width, height, compress, mask):
     array, valid = picture(height, width), disc(height, width) if mask else None
     write_array(
