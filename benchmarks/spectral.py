@@ -1,12 +1,15 @@
 """`register` with method `auto` on pairs made from known ones: registrations accepted by chance,
 the effect of other rotations, scales and shifts, and whether stated errors hold.
 
-    python benchmarks/spectral.py PAIRS.csv [--unrelated 300] [--rounds 3] [--stated 300]
+    python benchmarks/spectral.py PAIRS.csv [--unrelated 300] [--rounds 3] [--stated 300] [--marks]
 
 Unrelated: image A of one pair with the MIRRORED image B of any pair. No registration of them can be
 right, even if two pairs of the list show the same place, and the images have the statistics of the
 true pairs. Variations: image B of each pair is rotated, scaled, shifted and darkened; the truth is
 known.
+
+Marks: text, a scale and a logo, or all that a drone's screen shows besides, are written over both
+pictures, of unrelated pairs (image B mirrored and resized to A's size) and of true ones.
 
 Stated errors: the same variations, but a part of one picture is blank (no data, black, noise, or
 blurred beyond recognition), so that patches confirm the registration in the rest only. The search
@@ -48,6 +51,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--stated", type=int, default=0)
     parser.add_argument("--corners", type=float, default=0.0)
+    parser.add_argument("--marks", action="store_true")
     parser.add_argument("--seed", type=int, default=1)
     asked = parser.parse_args()
     pairs = read_pairs(Path(asked.pairs))
@@ -58,6 +62,8 @@ def main() -> None:
         variations(pairs, asked.rounds, rng)
     if asked.stated:
         stated(pairs, asked.stated, asked.corners, rng)
+    if asked.marks:
+        marked_pairs(pairs, rng)
 
 
 def unrelated(pairs: tuple[Pair, ...], count: int, rng: np.random.Generator) -> None:
@@ -169,8 +175,8 @@ def near_truth(a: Picture, b: Picture, truth: NDArray) -> Registration | Refused
     usable = both_usable(a, b)
     if isinstance(usable, RefusedRegistration):
         return usable
-    pyramid = Pyramid(a=usable[0], b=usable[1], sides=METHOD.sides[-2:])
-    return METHOD.decide(pyramid, [sharpened(pyramid, stiff(truth, a.shape), 0)])
+    pyramid = Pyramid(a=usable[0], b=usable[1], sides=METHOD.method.sides[-2:])
+    return METHOD.method.decide(pyramid, [sharpened(pyramid, stiff(truth, a.shape), 0)])
 
 
 def bent(
@@ -251,6 +257,76 @@ def varied(
             gamma.astype(np.uint8), change, (width, height), flags=cv2.INTER_LINEAR
         )
         yield pair, moved, change @ pair.b_H_a, scale
+
+
+def marked_pairs(pairs: tuple[Pair, ...], rng: np.random.Generator) -> None:
+    for screen in (False, True):
+        accepted = 0
+        for pair in pairs:
+            a, other = values(pair.a), values(pairs[int(rng.integers(len(pairs)))].b)
+            size = (a.shape[1], a.shape[0])
+            b = cv2.resize(np.ascontiguousarray(other[:, ::-1]), size, interpolation=cv2.INTER_AREA)
+            accepted += bool(METHOD(*(Picture(values=marked(v, screen)) for v in (a, b))))
+        right = []
+        for pair in pairs:
+            a, b = values(pair.a), values(pair.b)
+            outcome = METHOD(*(Picture(values=marked(v, screen)) for v in (a, b)))
+            if outcome:
+                error = overlap_error(outcome.b_H_a, pair.b_H_a, a.shape[:2], b.shape[:2])
+                right.append(error < pair.tolerance_px)
+        what = "a drone's screen" if screen else "text, scale and logo"
+        print(
+            f"{what}: {accepted} of {len(pairs)} unrelated pairs accepted;"
+            f" of the true ones {len(right)}, {sum(right)} right",
+            flush=True,
+        )
+
+
+def marked(picture: NDArray, screen: bool) -> NDArray:
+    """The picture with marks written over it, places in shares of its sides, kept as JPEG."""
+    out = np.ascontiguousarray(picture).copy()
+    height, width = out.shape[:2]
+    scale = min(height, width) / 480
+    thick = max(1, round(1.5 * scale))
+
+    def at(x: float, y: float) -> tuple[int, int]:
+        return int(x * width), int(y * height)
+
+    def ink(level: int) -> tuple[int, ...]:
+        return (level,) * (1 if out.ndim == 2 else out.shape[2])
+
+    def text(x: float, y: float, words: str, size: float = 0.6) -> None:
+        font = cv2.FONT_HERSHEY_SIMPLEX
+        if screen:
+            cv2.putText(out, words, at(x, y), font, size * scale, ink(0), 3 * thick, cv2.LINE_AA)
+        cv2.putText(out, words, at(x, y), font, size * scale, ink(255), thick, cv2.LINE_AA)
+
+    text(0.03, 0.06, "2026-11-24 14:20:15")
+    text(0.03, 0.97, "N51.50374 W0.01234 120m")
+    text(0.86, 0.18, "38.2")
+    text(0.86, 0.86, "12.4")
+    text(0.76, 0.97, "IR", 0.9)
+    middle, arm = at(0.5, 0.5), int(0.05 * width)
+    for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        ends = [(middle[0] + dx * r, middle[1] + dy * r) for r in (arm // 3, arm)]
+        cv2.line(out, *ends, ink(255), thick, cv2.LINE_AA)
+    bar = int(0.6 * height)
+    for k in range(bar):
+        out[int(0.2 * height) + k, int(0.94 * width) : int(0.97 * width)] = 255 - int(255 * k / bar)
+    cv2.rectangle(out, at(0.94, 0.2), at(0.97, 0.8), ink(255), thick)
+    if screen:
+        for k in range(9):
+            y = 0.2 + 0.07 * k
+            cv2.line(out, at(0.06, y), at(0.1 if k % 2 else 0.13, y), ink(255), thick)
+            text(0.14, y + 0.01, str(40 + 10 * k), 0.4)
+        for k in range(13):
+            x = 0.2 + 0.05 * k
+            cv2.line(out, at(x, 0.09), at(x, 0.11 if k % 3 else 0.13), ink(255), thick)
+        text(0.6, 0.06, "REC 00:12:44 ISO100")
+        text(0.3, 0.9, "D 243m H 120m HS 8.2m/s VS 0.1", 0.5)
+        cv2.rectangle(out, at(0.35, 0.35), at(0.65, 0.65), ink(255), thick)
+    _, data = cv2.imencode(".jpg", out, [cv2.IMWRITE_JPEG_QUALITY, 90])
+    return cv2.imdecode(data, cv2.IMREAD_GRAYSCALE if out.ndim == 2 else cv2.IMREAD_COLOR)
 
 
 def values(path: Path) -> NDArray:

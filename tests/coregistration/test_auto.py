@@ -33,7 +33,7 @@ def test_any_rotation_is_found_to_a_part_of_a_pixel(auto, scale, degrees):
 
 def test_the_search_alone_finds_it_too(auto):
     blind = replace(
-        auto, propose=StructureMatches(estimate=lambda a, b: NoEstimate(reason="not asked"))
+        auto.method, propose=StructureMatches(estimate=lambda a, b: NoEstimate(reason="not asked"))
     )
     truth = turned(1.15, 251.0, SHAPE, SHAPE, (-20.0, 11.0))
     a, b = pair(truth, seed=3)
@@ -166,7 +166,7 @@ def test_large_pictures_are_sharpened_at_a_finer_resolution(auto):
     a = np.clip(spectrum(labels, 1, blur=1.5), 0, 255).astype(np.uint8)
     b = cv2.warpPerspective(spectrum(labels, 2, blur=1.5), truth, (2000, 1500))
     pictures = Picture(values=a), Picture(values=np.clip(b, 0, 255).astype(np.uint8))
-    coarse = replace(auto, decide=replace(auto.decide, finest=1e9))(*pictures)
+    coarse = replace(auto.method, decide=replace(auto.method.decide, finest=1e9))(*pictures)
     fine = auto(*pictures)
     assert error(fine.b_H_a, truth, shape) < 0.15 < error(coarse.b_H_a, truth, shape) < 1.5
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from skyquilt import registry
 from skyquilt.coregistration.auto import Auto
+from skyquilt.coregistration.marks import WithoutMarks
 from skyquilt.coregistration.shapes import ShapeMatches
 from skyquilt.coregistration.structure import Structure, StructureMatches
 from skyquilt.errors import UsageError
@@ -60,19 +61,19 @@ def registration_method(name: str) -> Registers:
     return made
 
 
-def auto() -> Auto:
+def auto() -> WithoutMarks:
     """Orientation correlation, helped by structure matches, verified by patches."""
-    return Auto(propose=_proposals())
+    return WithoutMarks(method=Auto(propose=_proposals()))
 
 
-def structure() -> Structure:
+def structure() -> WithoutMarks:
     """A structure descriptor alone, verified by patches."""
-    return Structure(propose=_proposals())
+    return WithoutMarks(method=Structure(propose=_proposals()))
 
 
-def shapes() -> Structure:
+def shapes() -> WithoutMarks:
     """Areas and objects as shapes, verified by patches."""
-    return Structure(propose=ShapeMatches())
+    return WithoutMarks(method=Structure(propose=ShapeMatches()))
 
 
 def _proposals() -> StructureMatches:

@@ -46,7 +46,7 @@ def usable(picture: Picture) -> Usable:
     """Brightness and valid part of an image. A black or white frame, as in rotated images, is
     excluded: its edges would be matched as structure, and its shape would reveal the rotation.
     """
-    band = _one_band(picture.values)
+    band = one_band(picture.values)
     finite = np.isfinite(band)
     grey = np.where(finite, band, 0).astype(np.float32)
     given = finite if picture.valid is None else finite & picture.valid
@@ -54,7 +54,8 @@ def usable(picture: Picture) -> Usable:
     return Usable(grey=grey, valid=valid, reason=_reason(grey, valid))
 
 
-def _one_band(values: NDArray[Any]) -> NDArray[np.float32]:
+def one_band(values: NDArray[Any]) -> NDArray[np.float32]:
+    """(H, W) brightness of values (H, W) or (H, W, bands)."""
     if values.ndim == 2:
         return values.astype(np.float32)
     if values.shape[2] == 3:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.coregistration.decision import Decide
+from skyquilt.coregistration.marks import WithoutMarks
 from skyquilt.coregistration.methods import INLIERS, SAMPLES
 from skyquilt.coregistration.orientation import Pyramid
 from skyquilt.coregistration.structure import sharpened
@@ -285,9 +286,9 @@ def surf_and_rfae() -> BetterByQ:
     return BetterByQ(methods=(surf(), rfae()))
 
 
-def rfae_refined() -> Refined:
+def rfae_refined() -> WithoutMarks:
     """SURF along edges, refined and confirmed by patches."""
-    return Refined(method=rfae())
+    return WithoutMarks(method=Refined(method=rfae()))
 
 
 def _sift() -> Sift:
