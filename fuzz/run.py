@@ -112,10 +112,14 @@ def main() -> int:
         command = [sys.executable, "-m", "fuzz.run", name, "--seconds", str(seconds)]
         if asked.seed is not None:
             command += ["--seed", str(asked.seed)]
+        # the fuzzer ends without Python's clean-up: what targets write goes with the corpora
+        env = {**os.environ, "TMPDIR": str(corpora)}
+        if asked.seed is not None:
+            env["PYTHONHASHSEED"] = "0"
         began = time.monotonic()
         done = subprocess.run(
             [*command, "--corpus", str(corpora / name)],
-            env={**os.environ, "PYTHONHASHSEED": "0"} if asked.seed is not None else None,
+            env=env,
             capture_output=True,
             text=True,
             errors="replace",
