@@ -1,7 +1,10 @@
 """Folders that photos are copied into, by writers of all manners."""
 
+import errno
+import os
 import shutil
 import time
+from pathlib import Path
 
 import pytest
 
@@ -116,3 +119,25 @@ def test_a_file_that_vanishes_is_forgotten(watched, flight):
     path.unlink()
     assert watched.look(0.2) == []
     assert not watched.watch.growing
+
+
+def test_a_folder_that_cannot_be_read_is_named_once(watched, flight, monkeypatch):
+    hidden = watched.folder / "drone 2"
+    hidden.mkdir()
+    shutil.copyfile(flight.photos[0], hidden / "a.jpg")
+    honest, closed = os.scandir, [True]
+
+    def scandir(path):
+        if closed[0] and Path(path) == hidden:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return honest(path)
+
+    monkeypatch.setattr(os, "scandir", scandir)
+    done = watched.look(1.5)
+    told = [d for d in done if isinstance(d, Refused)]
+    assert [(d.name, d.reason) for d in told] == [
+        ("drone 2", "this folder cannot be read (Permission denied)")
+    ]
+    closed[0] = False
+    done += watched.look(2.5)
+    assert [d.name for d in done if isinstance(d, Accepted)] == ["a.jpg"]

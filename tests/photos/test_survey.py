@@ -1,5 +1,8 @@
+import errno
+import os
 import shutil
 from datetime import datetime
+from pathlib import Path
 
 import numpy as np
 import piexif
@@ -269,3 +272,35 @@ def test_other_content_under_the_name_of_a_photo_is_named(tmp_path, content, wha
     path.write_bytes(content)
     found = read_photo(path)
     assert isinstance(found, RejectedPhoto) and what in found.reason
+
+
+@pytest.fixture
+def closed(monkeypatch):
+    """Folders that the system does not let be read, whoever runs the tests."""
+    folders = set()
+    honest = os.scandir
+
+    def scandir(path):
+        if Path(path) in folders:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return honest(path)
+
+    monkeypatch.setattr(os, "scandir", scandir)
+    return folders
+
+
+def test_folders_that_cannot_be_read_are_named(make_jpeg, closed):
+    folder = flight(make_jpeg)
+    hidden = make_jpeg("second card/a.jpg", exif=dji_exif(), seed=50).parent
+    assert len(read_survey(folder).photos) == 6
+    closed.add(hidden)
+    for source, name in ((folder, "second card"), ([folder / "p1.JPG", hidden], str(hidden))):
+        survey = read_survey(source)
+        assert len(survey.photos) in (5, 1)
+        told = [n for n in survey.notes if "cannot be read" in n]
+        assert len(told) == 1
+        assert told[0].startswith(
+            f"1 folder cannot be read, and photos in there are not in the map: {name[:20]}"
+        )
+    with pytest.raises(NoPhotosError, match="can be found: 1 folder cannot be read"):
+        read_survey([hidden])

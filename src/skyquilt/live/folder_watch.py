@@ -76,6 +76,7 @@ class Watch:
     growing: dict[str, Growing] = field(default_factory=dict)
     """Files that are not taken yet, by path."""
     _clips: dict[str, tuple[Stamp, Taking]] = field(default_factory=dict)
+    _closed_folders: dict[Path, str] = field(default_factory=dict)
     _due: float = 0.0
 
     def __post_init__(self) -> None:
@@ -96,7 +97,11 @@ class Watch:
         now = (
             time.monotonic()
         )  # one time for all, so that files that arrived together are taken in order
+        told = set(self._closed_folders)
         self._note(now)
+        for path in sorted(self._closed_folders.keys() - told):
+            reason = f"this folder cannot be read ({self._closed_folders[path]})"
+            yield self.intake.refuse(path.name, self.folder.name, reason)
         for key in sorted(self.growing, key=Path):
             known = self.growing[key]
             if not known.closed and now - known.since < QUIET_S:
@@ -176,9 +181,13 @@ class Watch:
         return [(path, _stamp(path)) for path in known]
 
     def _files(self) -> Iterator[Path]:
-        for here, folders, names in walk(self.folder):
+        for here, folders, names in walk(self.folder, self._cannot):
             folders[:] = [f for f in folders if not f.startswith(".")]
             yield from (here / name for name in names if _photo_name(name))
+
+    def _cannot(self, folder: Path, error: OSError) -> None:
+        if folder.is_dir():  # not one that is gone by now
+            self._closed_folders[folder] = error.strerror or str(error)
 
     def _unfinished(self, path: Path, *, patient: bool) -> str:
         """Why a file cannot be taken (yet); empty where it can. Raises `FileNotFoundError`."""
