@@ -146,11 +146,15 @@ def test_a_restart_finds_everything_as_it_was(small, flight):
     other.close()
 
 
-def test_other_settings_are_refused_on_the_same_folder(small):
-    from skyquilt.errors import UsageError
-
-    with pytest.raises(UsageError, match="features"):
-        LiveMap(small.folder, LiveSettings(features=300))
+@pytest.mark.parametrize(
+    "other",
+    [{"features": 300}, {"gsd_cm": 7.0}, {"crs": "EPSG:32634"}, {"vertical_datum": "ellipsoid"}],
+    ids=lambda other: next(iter(other)),
+)
+def test_other_settings_are_refused_on_the_same_folder(flight, tmp_path, other):
+    LiveMap(tmp_path / "out", LiveSettings()).close()
+    with pytest.raises(UsageError, match=next(iter(other))):
+        LiveMap(tmp_path / "out", LiveSettings(**other))
 
 
 @pytest.mark.parametrize(

@@ -228,7 +228,12 @@ def on_sphere(photos: Sequence[Photo]) -> Array:
     """Positions (n, 3) in m on a sphere, of those photos that have one: distances between them
     do not depend on the pole or on the meridian of 180 degrees.
     """
-    north, east = np.radians(_degrees(photos)).T
+    return sphere(_degrees(photos))
+
+
+def sphere(degrees: Array) -> Array:
+    """Latitudes and longitudes (n, 2) in degrees as places (n, 3) in m on a sphere."""
+    north, east = np.radians(degrees).T
     flat = np.cos(north)
     return _EARTH_M * np.stack([flat * np.cos(east), flat * np.sin(east), np.sin(north)], 1)
 
