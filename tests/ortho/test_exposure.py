@@ -208,6 +208,7 @@ def test_nothing_to_compare(lit):
     assert Balance()(views, black, FLAT, GRID.bounds) is NEUTRAL
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_an_area_that_some_photos_do_not_show(lit):
     """A map of one pixel, in one corner: the others have no sample at all."""
     views, pictures, _ = lit
