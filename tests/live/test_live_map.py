@@ -2,7 +2,9 @@
 
 import re
 import shutil
+import socket
 import sqlite3
+import threading
 import time
 
 import numpy as np
@@ -270,6 +272,23 @@ def test_equal_photos_in_equal_order_give_equal_poses(flight, tmp_path):
         assert np.array_equal(m.pose.cam_R_map, other.members.by_id[i].pose.cam_R_map)
     one.close()
     other.close()
+
+
+@pytest.mark.parametrize("url", ["http://[x", "http://a b", "http://127.0.0.1:{port}", "http://ü/"])
+def test_an_address_where_no_server_of_ours_answers_gets_a_sentence(flight, url):
+    """No address at all, or a server of another kind."""
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+
+        def answers():
+            client, _ = other.accept()
+            client.recv(1000)
+            client.sendall(b"220 mail.example ready\r\n")
+            client.close()
+
+        threading.Thread(target=answers, daemon=True).start()
+        with pytest.raises(UsageError, match="does not answer"):
+            list(fly(flight.folder, url.format(port=port), FlySettings(rate=20)))
 
 
 def test_replays_lose_and_reorder_as_asked(flight, tmp_path):
