@@ -243,6 +243,17 @@ def test_of_two_photos_far_apart_both_stay_and_the_note_says_so(make_jpeg):
     assert any("334 km apart" in n for n in survey.notes)
 
 
+def test_two_positions_far_apart_among_photos_without_any_are_not_used(make_jpeg):
+    for i, latitude in enumerate((46.0, 49.0, None)):
+        exif = dji_exif()
+        exif["GPS"] = {} if latitude is None else gps_exif(latitude, 9.0)
+        folder = make_jpeg(f"{i}.jpg", exif=exif, seed=i).parent
+    survey = read_survey(folder)
+    assert not any(p.position for p in survey.photos)
+    told = [n for n in survey.notes if "334 km apart" in n]
+    assert len(told) == 1 and told[0].endswith("neither is used.")
+
+
 def test_a_flight_at_height_zero_counts_from_sea_level_instead(make_jpeg):
     for i in range(3):
         folder = make_jpeg(
