@@ -237,6 +237,15 @@ def test_live_creates_its_inbox_or_fails_before_anything_else(tmp_path):
     assert result.output == "" and not (tmp_path / "out").exists()
 
 
+def test_live_into_its_own_inbox_is_refused_and_writes_nothing(tmp_path):
+    words = ["live", str(tmp_path), "-o", str(tmp_path / "." / "x" / ".."), "--port", "0"]
+    (tmp_path / "x").mkdir()
+    result = CliRunner().invoke(commands.app, words)
+    assert isinstance(result.exception, errors.UsageError)
+    assert "is the folder of the photos" in str(result.exception)
+    assert [p.name for p in tmp_path.iterdir()] == ["x"]
+
+
 def test_shells_can_complete_commands():
     env = {"_SKYQUILT_COMPLETE": "complete_bash", "COMP_WORDS": "skyquilt exp", "COMP_CWORD": "1"}
     code = "from skyquilt.cli.app import app; app(prog_name='skyquilt')"

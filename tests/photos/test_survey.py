@@ -120,9 +120,12 @@ def test_hidden_files_and_earlier_runs_are_passed_over(make_jpeg):
     make_jpeg(".p8.jpg", seed=31)
     make_jpeg("out/mosaic.jpg", seed=32)
     (folder / "out" / "run.toml").write_text("")
+    make_jpeg("live/map.jpg", seed=33)
+    (folder / "live" / "live.db").write_text("")
     survey = read_survey(folder)
     assert len(survey.photos) == 2
-    assert any("The folder out contains an earlier run" in n for n in survey.notes)
+    for name in ("out", "live"):
+        assert any(f"The folder {name} contains an earlier run" in n for n in survey.notes)
 
 
 def test_a_photo_300_km_away_loses_its_position_but_stays(make_jpeg):

@@ -36,8 +36,8 @@ _OTHER_PICTURES = frozenset(
     )
 )
 """Endings of pictures in formats that are not read."""
-_RUN_MARK = "run.toml"
-_RUN_STATE = ".skyquilt"
+RUN_MARKS = frozenset({"run.toml", "live.db", ".skyquilt"})
+"""What the folder of an earlier run or of a live map holds, each one or another of these."""
 _SIDE_NAMES = frozenset({"geo.txt", "gcp_list.txt"})
 
 
@@ -63,8 +63,8 @@ def find_files(source: Path | Sequence[Path]) -> FoundFiles:
     """Finds photos by file name extension in a folder and its subfolders, or among single files.
 
     Hidden files and folders are skipped, and so are folders of earlier runs (they contain
-    `run.toml`, or `.skyquilt` while a run is not finished). Raises `UsageError` where a given path
-    does not exist.
+    `run.toml`, or `.skyquilt` while a run is not finished) and of live maps. Raises `UsageError`
+    where a given path does not exist.
     """
     if isinstance(source, (str, Path)) and Path(source).is_dir():
         return _in_folder(Path(source))
@@ -93,7 +93,7 @@ def _walk(
     folder: Path, runs: list[str], top: Path, unread: Callable[[Path, OSError], None]
 ) -> Iterator[Path]:
     for here, folders, files in walk(folder, unread):
-        if here != top and (_RUN_MARK in files or _RUN_STATE in folders):
+        if here != top and not RUN_MARKS.isdisjoint((*files, *folders)):
             runs.append(_text(here.relative_to(top).as_posix()))
             folders.clear()
             continue
