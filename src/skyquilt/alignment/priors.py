@@ -14,11 +14,11 @@ from skyquilt.model.photo import ControlPoint, Photo
 from skyquilt.model.poses import MapFrame, Prior
 from skyquilt.outside import plain
 
-STEP_M = 50.0
+STRETCH_STEP_M = 50.0
 """Way in m over which a coordinate system's scale is measured."""
-TOLD, REFUSED = 0.005, 0.05
+STRETCH_TOLD, STRETCH_REFUSED = 0.005, 0.05
 """Departures of the scale from one that are told, and that are refused."""
-TURNED_DEG = 3.0
+NORTH_OFF_DEG = 3.0
 """Departure of north from where a coordinate system should have it that is refused: systems with
 axes west and south are 180 degrees off.
 """
@@ -115,8 +115,10 @@ def stretch(crs: str, latitude: float, longitude: float) -> NDArray[np.float64]:
     """(2, 2) map coordinates of a way of one metre to the east (first column) and to the north."""
     to_map, geod = Transformer.from_crs(4326, crs, always_xy=True), CRS(crs).get_geod()
     here = np.array(to_map.transform(longitude, latitude))
-    ends = [(geod or Geod(ellps="WGS84")).fwd(longitude, latitude, a, STEP_M) for a in (90, 0)]
-    return np.array([to_map.transform(lon, lat) - here for lon, lat, _ in ends]).T / STEP_M
+    ends = [
+        (geod or Geod(ellps="WGS84")).fwd(longitude, latitude, a, STRETCH_STEP_M) for a in (90, 0)
+    ]
+    return np.array([to_map.transform(lon, lat) - here for lon, lat, _ in ends]).T / STRETCH_STEP_M
 
 
 def stretch_warnings(frame: MapFrame) -> list[str]:
@@ -126,7 +128,7 @@ def stretch_warnings(frame: MapFrame) -> list[str]:
     to_wgs = Transformer.from_crs(frame.crs, 4326, always_xy=True)
     longitude, latitude = to_wgs.transform(*frame.origin)
     most = _farthest_from_one(stretch(frame.crs, latitude, longitude))
-    if abs(most - 1) <= TOLD:
+    if abs(most - 1) <= STRETCH_TOLD:
         return []
     return [
         f"A metre on the ground is {most:.3f} m in {plain(frame.crs, 80)} here, so lengths, areas"
@@ -157,13 +159,16 @@ def _check_suits(crs: str, latitude: float, longitude: float, convergence: float
             f"{where} has no coordinates for {latitude:.2f}, {longitude:.2f}; {advice}"
         )
     most = _farthest_from_one(jacobian)
-    if abs(most - 1) > REFUSED:
+    if abs(most - 1) > STRETCH_REFUSED:
         raise UsageError(
             f"{where} stretches a metre at {latitude:.2f}, {longitude:.2f} to {most:.2f} m, and"
             f" heights would be wrong by as much; {advice}"
         )
     north = np.degrees(np.arctan2(*jacobian[:, 1]))
-    if np.linalg.det(jacobian) < 0 or abs(angle_difference_deg(north, -convergence)) > TURNED_DEG:
+    if (
+        np.linalg.det(jacobian) < 0
+        or abs(angle_difference_deg(north, -convergence)) > NORTH_OFF_DEG
+    ):
         raise UsageError(f"{where} has axes that do not point east and north; {advice}")
 
 
