@@ -13,7 +13,7 @@ import sqlite3
 import stat
 import time
 import unicodedata
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -186,10 +186,13 @@ def unzipped(archive: "ZipFile", name: str, most: int) -> bytes:
     return content
 
 
-def walk(top: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
+def walk(
+    top: Path, unread: Callable[[Path, OSError], None] | None = None
+) -> Iterator[tuple[Path, list[str], list[str]]]:
     """Folders below `top`, each with the names of its subfolders, from which the caller may remove
     some, and of its other files, both sorted. Links to folders are not followed; folders that
-    cannot be read count as empty. Unlike `os.walk` it takes any depth.
+    cannot be read count as empty, and `unread` is told of them. Unlike `os.walk` it takes any
+    depth.
     """
     waiting = [top]
     while waiting:
@@ -197,7 +200,9 @@ def walk(top: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
         try:
             with os.scandir(here) as found:
                 entries = [(e.name, e.is_dir(follow_symlinks=False)) for e in found]
-        except OSError:
+        except OSError as error:
+            if unread is not None:
+                unread(here, error)
             continue
         folders = sorted(name for name, folder in entries if folder)
         yield here, folders, sorted(name for name, folder in entries if not folder)

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyproj import CRS, Geod, Transformer
 
-from skyquilt.alignment.priors import choose_frame, priors, utm_epsg
+from skyquilt.alignment.priors import choose_frame, priors, stretch, stretch_warnings, utm_epsg
 from skyquilt.errors import UsageError
 from skyquilt.model.photo import Attitude, ControlPoint, GeoPosition
 from tests.alignment.surveys import photo
@@ -104,6 +104,49 @@ def test_a_crs_asked_for():
 def test_a_crs_that_will_not_do(crs, words):
     with pytest.raises(UsageError, match=words):
         choose_frame([at(50.8, -0.14)], crs)
+
+
+@pytest.mark.parametrize(
+    ("crs", "place", "words"),
+    [
+        ("EPSG:6933", (46.6, 14.3), "stretches a metre at 46.60, 14.30 to 0.79 m one way"),
+        ("EPSG:4087", (60.0, 14.3), "to 1.00 m one way and to 1.99 m the other"),
+        ("EPSG:2048", (-33.9, 19.0), "axes that do not point east and north"),  # west, south
+        ("EPSG:5513", (50.0, 14.0), "axes that do not point east and north"),  # south, west
+        ("EPSG:3031", (50.8, -0.14), "stretches a metre|has no coordinates"),
+    ],
+)
+def test_a_crs_that_does_not_suit_the_place(crs, place, words):
+    """Maps were mirrored in South Africa."""
+    with pytest.raises(UsageError, match=words):
+        choose_frame([at(*place)], crs)
+
+
+@pytest.mark.parametrize(
+    ("crs", "place", "told"),
+    [
+        ("EPSG:2056", (46.6, 8.0), False),
+        ("EPSG:5514", (50.0, 14.0), False),  # Krovak, north 8 degrees off the grid
+        ("EPSG:32661", (85.0, 30.0), False),  # the pole's own, turned by 30 degrees
+        ("EPSG:31467", (50.0, 9.0), False),  # northing is named first
+        ("EPSG:3577", (-42.0, 147.0), True),  # Albers: 2.6 % at Tasmania
+        ("EPSG:3034", (46.0, 14.0), True),  # 3.1 %
+        ("EPSG:3857", (50.8, -0.14), True),  # Web Mercator: 58 %, whichever way
+    ],
+)
+def test_a_crs_that_keeps_shapes_is_taken_and_told(crs, place, told):
+    frame = choose_frame([at(*place)], crs)
+    warnings = stretch_warnings(frame)
+    assert len(warnings) == told
+    if crs == "EPSG:3857":
+        assert "is 1.5" in warnings[0] and "heights" in warnings[0]
+    lat, lon = place
+    found = stretch(crs, lat, lon)
+    to = Transformer.from_crs(4326, crs, always_xy=True)
+    a, b = (lon, lat), Geod(ellps="WGS84").fwd(lon, lat, 37.0, 100.0)[:2]
+    way = np.array(to.transform(*b)) - to.transform(*a)
+    east, north = np.sin(np.radians(37.0)) * 100, np.cos(np.radians(37.0)) * 100
+    assert way == pytest.approx(found @ [east, north], abs=0.02)
 
 
 def test_without_positions_the_control_points_give_the_frame():

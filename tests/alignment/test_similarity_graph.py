@@ -186,6 +186,22 @@ def test_georeferencing_with_wrong_positions(share):
     assert np.degrees(np.abs(np.angle(found.a / a))).max() < 3
 
 
+@pytest.mark.parametrize("apart", [0.0, 1e-9])
+@pytest.mark.parametrize("away_m", [50.0, 1.6e7])
+def test_two_positions_of_one_place_give_no_scale(apart, away_m):
+    """Of all photos two have positions, and show the same place: copies that were given others."""
+    a, t, links, solution = solved(7)
+    position = np.full(len(a), np.nan + 0j)
+    position[3:5] = t[3], t[3] + away_m
+    where = solution.t.copy()
+    where[4] = where[3] + apart
+    found, _, metric = georeference(
+        replace(solution, t=where), links, priors_at(position, yaw=-np.degrees(np.angle(a)), z=60.0)
+    )
+    assert metric and np.isfinite(found.t).all()
+    assert np.median(np.abs(found.a)) == pytest.approx(60.0, rel=1e-3)
+
+
 def test_half_turn_lies_of_the_yaw_do_not_turn_the_block():
     """Positions give the direction; without them the majority of the yaws does."""
     a, t, links, solution = solved(7)

@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -236,6 +237,15 @@ def test_live_creates_its_inbox_or_fails_before_anything_else(tmp_path):
     assert result.output == "" and not (tmp_path / "out").exists()
 
 
+def test_live_into_its_own_inbox_is_refused_and_writes_nothing(tmp_path):
+    words = ["live", str(tmp_path), "-o", str(tmp_path / "." / "x" / ".."), "--port", "0"]
+    (tmp_path / "x").mkdir()
+    result = CliRunner().invoke(commands.app, words)
+    assert isinstance(result.exception, errors.UsageError)
+    assert "is the folder of the photos" in str(result.exception)
+    assert [p.name for p in tmp_path.iterdir()] == ["x"]
+
+
 def test_shells_can_complete_commands():
     env = {"_SKYQUILT_COMPLETE": "complete_bash", "COMP_WORDS": "skyquilt exp", "COMP_CWORD": "1"}
     code = "from skyquilt.cli.app import app; app(prog_name='skyquilt')"
@@ -275,6 +285,77 @@ def test_a_name_that_the_system_refuses_gets_a_sentence(monkeypatch, capsys, tmp
     said = capsys.readouterr().err
     assert code in (2, 3, 5), said
     assert "skyquilt: " in said and "Traceback" not in said
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("mosaic", "", "-o", "OUT"),
+        ("mosaic", "IN", "-o", ""),
+        ("mosaic", "IN", "--output="),
+        ("view", "OUT", "--token", ""),
+    ],
+)
+def test_a_variable_that_is_not_set_is_no_current_folder(monkeypatch, capsys, tmp_path, words):
+    (tmp_path / "IN").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert run(monkeypatch, *words) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("skyquilt: ") and "a variable in the command is not set" in told
+    assert [p.name for p in tmp_path.iterdir()] == ["IN"]
+
+
+def test_a_current_folder_that_is_gone_gets_a_sentence(monkeypatch, capsys, tmp_path):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    try:
+        assert run(monkeypatch, "mosaic", tmp_path, "-o", "OUT") == 2
+    finally:
+        os.chdir(tmp_path)
+    assert "the current folder cannot be used" in capsys.readouterr().err
+
+
+def in_shell(line, *words):
+    """Exit code and standard error of the command `"$@"` in a line of a shell."""
+    words = ["sh", "-c", line, "sh", sys.executable, "-m", "skyquilt", *map(str, words)]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=60)
+    return done.returncode, done.stderr
+
+
+def test_closed_streams_change_nothing(tmp_path):
+    """Without them sentences could not be written, and files would get their numbers."""
+    words = ("mosaic", tmp_path, "-o", tmp_path / "out")
+    assert in_shell('"$@" 2>&-', *words) == (3, "")
+    assert in_shell('"$@" <&- >&- 2>&-', *words) == (3, "")
+    said = in_shell('"$@" <&- >&-', *words)
+    assert said[0] == 3 and said[1].startswith("skyquilt: There is no photo")
+    code = (
+        "import os; from skyquilt.cli.main import _streams; _streams();"
+        "os._exit(os.open(os.devnull, os.O_RDONLY))"
+    )
+    done = subprocess.run(
+        ["sh", "-c", f"{sys.executable} -c '{code}' <&- >&- 2>&-"], check=False, timeout=60
+    )
+    assert done.returncode >= 3
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no full device")
+@pytest.mark.parametrize("words", [("--version",), ("mosaic", "--help")])
+def test_output_to_a_full_disk_gets_a_sentence(words):
+    code, told = in_shell('"$@" >/dev/full', *words)
+    assert code == 5
+    assert told.startswith("skyquilt: what is printed, or a file, cannot be written (No space")
+    assert told.count("\n") == 1
+
+
+def test_too_few_addresses_get_a_sentence(tmp_path):
+    """With these, libraries end the process by a fault of memory in the middle of a run."""
+    code, told = in_shell('ulimit -v 700000; "$@"', "mosaic", tmp_path, "-o", tmp_path / "out")
+    assert code == 1
+    assert told.startswith("skyquilt: the system allows 717 MB of addresses")
+    assert told.count("\n") == 1
+    assert in_shell('ulimit -v 1000000; "$@"', "mosaic", tmp_path, "-o", tmp_path / "out")[0] == 3
 
 
 @pytest.mark.parametrize(

@@ -162,6 +162,16 @@ def test_bounds_that_cut_the_map(mosaic, flight, finished):
     assert told.metrics["size_px"] == pytest.approx([100, 100], abs=2)
 
 
+@pytest.mark.parametrize("side", [0.1, 1.0])
+def test_bounds_of_some_pixels(mosaic, flight, finished, side):
+    """Most photos show none of so small a map."""
+    with rasterio.open(finished / "mosaic.tif") as whole:
+        x, y = (round(v) for v in whole.xy(whole.height // 2, whole.width // 2))
+    told = mosaic(flight / "photos", "--bounds", f"{x},{y},{x + side},{y + side}", "--gsd", "10")
+    wanted = [round(side / 0.1)] * 2
+    assert told.made().metrics["size_px"] == pytest.approx(wanted, abs=1)
+
+
 @pytest.mark.slow
 def test_little_memory_is_enough(mosaic, flight):
     told = mosaic(flight / "photos", "--memory", "0.5").made()

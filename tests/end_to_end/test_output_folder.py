@@ -77,6 +77,12 @@ def test_output_below_a_file(mosaic, flight, tmp_path):
     assert (tmp_path / "file").read_text() == "x"
 
 
+@pytest.mark.parametrize("to", ["out", "nowhere/at all"])
+def test_an_output_that_is_a_link_to_nowhere(mosaic, flight, tmp_path, to):
+    (tmp_path / "out").symlink_to(to)
+    mosaic(flight / "photos").refused(5, "out is a link that leads nowhere")
+
+
 @pytest.fixture
 def small_disk(tmp_path):
     """A function that mounts a disk of some size; skipped where that is not permitted."""

@@ -61,6 +61,10 @@ IN_NO_KEY = {
         "limits of files that are refused: they shape no result",
     ),
     **dict.fromkeys(
+        ("STRETCH_STEP_M", "STRETCH_TOLD", "STRETCH_REFUSED", "STRETCH_MOST") + ("NORTH_OFF_DEG",),
+        "coordinate systems that are refused, or told of: they shape no result",
+    ),
+    **dict.fromkeys(
         ("NOISE", "TEXTURE", "RIM", "_DERIVE", "_SMOOTH", "RADIUS", "MIN_PEAK", "BROAD_PEAK")
         + ("APART", "MAX_RATIO", "SIDE", "COARSE"),
         "seams are measured anew by every run",

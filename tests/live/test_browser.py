@@ -13,6 +13,7 @@ from PIL import Image
 from playwright.sync_api import sync_playwright
 
 from skyquilt.live.settings import LiveSettings
+from tests.end_to_end.conftest import relabel
 from tests.live.conftest import served
 
 pytestmark = pytest.mark.slow
@@ -42,9 +43,19 @@ def page(browser):
     page = context.new_page()
     page.errors = []
     page.on("pageerror", lambda error: page.errors.append(str(error)))
-    page.on("dialog", lambda dialog: (page.errors.append(dialog.message), dialog.dismiss()))
+    page.agrees = False
+    page.on("dialog", lambda dialog: answered(page, dialog))
     yield page
     context.close()
+
+
+def answered(page, dialog):
+    """A dialog of a page that does not `agree` is an error."""
+    if page.agrees:
+        dialog.accept()
+    else:
+        page.errors.append(dialog.message)
+        dialog.dismiss()
 
 
 def shot(page, name):
@@ -73,6 +84,25 @@ def coloured(page):
     """Share of the map that is neither background nor white."""
     pixels = seen(page)
     return float((np.abs(pixels - (217, 217, 217)).max(-1) > 12).mean())
+
+
+def test_a_flight_without_positions_is_explained_and_finished(page, flight, tmp_path):
+    with served(tmp_path / "out", QUICK) as site:
+        page.agrees = True
+        page.goto(site.url)
+        holds(page, "document.querySelector('#empty h2').textContent.includes('on the map yet')")
+        for path in flight.photos[:4]:
+            copy = tmp_path / path.name
+            shutil.copyfile(path, copy)
+            relabel(copy, drop=("position",))
+            site.send(copy)
+        words = "document.querySelector('#empty').textContent"
+        holds(page, f"{words}.includes('No photo has a position so far')")
+        page.click("#finish")
+        holds(page, f"{words}.includes('The final map has no place on Earth')", 60)
+        holds(page, "document.querySelectorAll('#downloads a').length == 3")
+        shot(page, "without positions")
+        assert page.errors == []
 
 
 def dropped(page, name, content):

@@ -19,6 +19,7 @@ from rasterio.enums import Resampling
 from rasterio.vrt import WarpedVRT
 
 from skyquilt.errors import UsageError
+from skyquilt.live.live_map import LiveMap
 from skyquilt.live.settings import LiveSettings
 from skyquilt.raster.map_source import mercator
 from skyquilt.server.access import Guard
@@ -34,6 +35,22 @@ ENV = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
 
 def command(*words):
     return [sys.executable, "-m", "skyquilt", *map(str, words)]
+
+
+def test_the_final_map_takes_every_photo_that_was_taken(flight, tmp_path, monkeypatch):
+    """Larger than `mosaic` takes by default, where --max-mp was raised."""
+    from skyquilt.live import final_map
+
+    seen = []
+    monkeypatch.setattr(
+        final_map, "iter_mosaic", lambda _, __, asked, **___: seen.append(asked) or ()
+    )
+    settings = LiveSettings(most_mp=500.0)
+    live = LiveMap(tmp_path / "out", settings)
+    live.intake.take_file(flight.photos[0], "drone")
+    live.close()
+    list(final_map.iter_finish(tmp_path / "out", settings))
+    assert seen[0].input.max_mp == 500.0
 
 
 @pytest.fixture(scope="module")

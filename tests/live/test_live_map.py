@@ -2,7 +2,9 @@
 
 import re
 import shutil
+import socket
 import sqlite3
+import threading
 import time
 
 import numpy as np
@@ -146,11 +148,15 @@ def test_a_restart_finds_everything_as_it_was(small, flight):
     other.close()
 
 
-def test_other_settings_are_refused_on_the_same_folder(small):
-    from skyquilt.errors import UsageError
-
-    with pytest.raises(UsageError, match="features"):
-        LiveMap(small.folder, LiveSettings(features=300))
+@pytest.mark.parametrize(
+    "other",
+    [{"features": 300}, {"gsd_cm": 7.0}, {"crs": "EPSG:32634"}, {"vertical_datum": "ellipsoid"}],
+    ids=lambda other: next(iter(other)),
+)
+def test_other_settings_are_refused_on_the_same_folder(flight, tmp_path, other):
+    LiveMap(tmp_path / "out", LiveSettings()).close()
+    with pytest.raises(UsageError, match=next(iter(other))):
+        LiveMap(tmp_path / "out", LiveSettings(**other))
 
 
 @pytest.mark.parametrize(
@@ -266,6 +272,23 @@ def test_equal_photos_in_equal_order_give_equal_poses(flight, tmp_path):
         assert np.array_equal(m.pose.cam_R_map, other.members.by_id[i].pose.cam_R_map)
     one.close()
     other.close()
+
+
+@pytest.mark.parametrize("url", ["http://[x", "http://a b", "http://127.0.0.1:{port}", "http://ü/"])
+def test_an_address_where_no_server_of_ours_answers_gets_a_sentence(flight, url):
+    """No address at all, or a server of another kind."""
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+
+        def answers():
+            client, _ = other.accept()
+            client.recv(1000)
+            client.sendall(b"220 mail.example ready\r\n")
+            client.close()
+
+        threading.Thread(target=answers, daemon=True).start()
+        with pytest.raises(UsageError, match="does not answer"):
+            list(fly(flight.folder, url.format(port=port), FlySettings(rate=20)))
 
 
 def test_replays_lose_and_reorder_as_asked(flight, tmp_path):

@@ -1,10 +1,14 @@
 """Folders that photos are copied into, by writers of all manners."""
 
+import errno
+import os
 import shutil
 import time
+from pathlib import Path
 
 import pytest
 
+from skyquilt.errors import UsageError
 from skyquilt.live import folder_watch as watching
 from skyquilt.live.folder_watch import Watch
 from skyquilt.live.inbox import Inbox
@@ -16,10 +20,10 @@ from skyquilt.live.settings import LiveSettings
 class Watched:
     """A folder, what was taken from it, and the ledger."""
 
-    def __init__(self, home):
-        self.folder, self.out = home / "in", home / "out"
+    def __init__(self, home, out="out"):
+        self.folder, self.out = home / "in", home / out
         self.folder.mkdir()
-        self.out.mkdir()
+        self.out.mkdir(parents=True)
         self.ledger = Ledger(self.out, write=True)
         self.intake = Intake(self.ledger, Inbox(self.ledger, self.out / "photos"), LiveSettings())
         self.watch = Watch(folder=self.folder, intake=self.intake)
@@ -116,3 +120,54 @@ def test_a_file_that_vanishes_is_forgotten(watched, flight):
     path.unlink()
     assert watched.look(0.2) == []
     assert not watched.watch.growing
+
+
+def test_a_folder_that_cannot_be_read_is_named_once(watched, flight, monkeypatch):
+    hidden = watched.folder / "drone 2"
+    hidden.mkdir()
+    shutil.copyfile(flight.photos[0], hidden / "a.jpg")
+    honest, closed = os.scandir, [True]
+
+    def scandir(path):
+        if closed[0] and Path(path) == hidden:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return honest(path)
+
+    monkeypatch.setattr(os, "scandir", scandir)
+    done = watched.look(1.5)
+    told = [d for d in done if isinstance(d, Refused)]
+    assert [(d.name, d.reason) for d in told] == [
+        ("drone 2", "this folder cannot be read (Permission denied)")
+    ]
+    closed[0] = False
+    done += watched.look(2.5)
+    assert [d.name for d in done if isinstance(d, Accepted)] == ["a.jpg"]
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_maps_that_grow_below_the_folder_are_no_photos(tmp_path, flight, monkeypatch, told):
+    """The survey's own files, and those of an earlier run: they were mapped, again and again."""
+    if not told:
+        monkeypatch.setattr(watching.ClosedFiles, "_watch", lambda *_: False)
+    found = Watched(tmp_path, "in/survey")
+    earlier = found.folder / "earlier"
+    earlier.mkdir()
+    (earlier / "run.toml").write_text("")
+    shutil.copyfile(flight.photos[1], earlier / "mosaic.jpg")  # there before
+    shutil.copyfile(flight.photos[0], found.folder / "a.jpg")
+    done = found.look(1.3)
+    shutil.copyfile(flight.photos[2], found.out / "map.jpg")  # and while it is watched
+    shutil.copyfile(flight.photos[3], earlier / "dsm.jpg")
+    (found.out / "photos" / "deep").mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(flight.photos[4], found.out / "photos" / "deep" / "b.jpg")
+    done += found.look(1.3)
+    assert [d.name for d in done] == ["a.jpg"]
+    assert found.ledger.counts() == {"received": 1, "refused": 0}
+
+
+def test_the_folder_of_photos_itself_is_no_survey(tmp_path):
+    found = Watched(tmp_path)
+    (tmp_path / "link").symlink_to(found.out)
+    for folder in (found.out, tmp_path / "link", found.out / ".." / "out"):
+        with pytest.raises(UsageError, match="is the folder of the photos"):
+            Watch(folder=folder, intake=found.intake)

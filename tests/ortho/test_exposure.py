@@ -208,6 +208,19 @@ def test_nothing_to_compare(lit):
     assert Balance()(views, black, FLAT, GRID.bounds) is NEUTRAL
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_an_area_that_some_photos_do_not_show(lit):
+    """A map of one pixel, in one corner: the others have no sample at all."""
+    views, pictures, _ = lit
+    x, y = min((tuple(v.footprint.min(0)) for v in views), key=sum)
+    far = [
+        v for v in views if (v.footprint.min(0) - 0.2 * np.ptp(v.footprint, 0).max() > (x, y)).any()
+    ]
+    assert far
+    samples = Balance()._samples(views, pictures, FLAT, (x, y, x + 0.1, y + 0.1))
+    assert not set(samples.row) & {views.index(v) for v in far}
+
+
 def test_measured_values_are_never_touched(lit):
     views, _, _ = lit
     values = {v.photo: np.full((300, 400, 1), 21.5, np.float32) for v in views}

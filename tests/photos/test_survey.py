@@ -1,5 +1,8 @@
+import errno
+import os
 import shutil
 from datetime import datetime
+from pathlib import Path
 
 import numpy as np
 import piexif
@@ -117,9 +120,12 @@ def test_hidden_files_and_earlier_runs_are_passed_over(make_jpeg):
     make_jpeg(".p8.jpg", seed=31)
     make_jpeg("out/mosaic.jpg", seed=32)
     (folder / "out" / "run.toml").write_text("")
+    make_jpeg("live/map.jpg", seed=33)
+    (folder / "live" / "live.db").write_text("")
     survey = read_survey(folder)
     assert len(survey.photos) == 2
-    assert any("The folder out contains an earlier run" in n for n in survey.notes)
+    for name in ("out", "live"):
+        assert any(f"The folder {name} contains an earlier run" in n for n in survey.notes)
 
 
 def test_a_photo_300_km_away_loses_its_position_but_stays(make_jpeg):
@@ -240,6 +246,17 @@ def test_of_two_photos_far_apart_both_stay_and_the_note_says_so(make_jpeg):
     assert any("334 km apart" in n for n in survey.notes)
 
 
+def test_two_positions_far_apart_among_photos_without_any_are_not_used(make_jpeg):
+    for i, latitude in enumerate((46.0, 49.0, None)):
+        exif = dji_exif()
+        exif["GPS"] = {} if latitude is None else gps_exif(latitude, 9.0)
+        folder = make_jpeg(f"{i}.jpg", exif=exif, seed=i).parent
+    survey = read_survey(folder)
+    assert not any(p.position for p in survey.photos)
+    told = [n for n in survey.notes if "334 km apart" in n]
+    assert len(told) == 1 and told[0].endswith("neither is used.")
+
+
 def test_a_flight_at_height_zero_counts_from_sea_level_instead(make_jpeg):
     for i in range(3):
         folder = make_jpeg(
@@ -269,3 +286,35 @@ def test_other_content_under_the_name_of_a_photo_is_named(tmp_path, content, wha
     path.write_bytes(content)
     found = read_photo(path)
     assert isinstance(found, RejectedPhoto) and what in found.reason
+
+
+@pytest.fixture
+def closed(monkeypatch):
+    """Folders that the system does not let be read, whoever runs the tests."""
+    folders = set()
+    honest = os.scandir
+
+    def scandir(path):
+        if Path(path) in folders:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return honest(path)
+
+    monkeypatch.setattr(os, "scandir", scandir)
+    return folders
+
+
+def test_folders_that_cannot_be_read_are_named(make_jpeg, closed):
+    folder = flight(make_jpeg)
+    hidden = make_jpeg("second card/a.jpg", exif=dji_exif(), seed=50).parent
+    assert len(read_survey(folder).photos) == 6
+    closed.add(hidden)
+    for source, name in ((folder, "second card"), ([folder / "p1.JPG", hidden], str(hidden))):
+        survey = read_survey(source)
+        assert len(survey.photos) in (5, 1)
+        told = [n for n in survey.notes if "cannot be read" in n]
+        assert len(told) == 1
+        assert told[0].startswith(
+            f"1 folder cannot be read, and photos in there are not in the map: {name[:20]}"
+        )
+    with pytest.raises(NoPhotosError, match="can be found: 1 folder cannot be read"):
+        read_survey([hidden])

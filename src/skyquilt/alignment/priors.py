@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from pyproj import CRS, Proj, Transformer
+from pyproj import CRS, Geod, Proj, Transformer
 from pyproj.exceptions import CRSError
 
 from skyquilt.alignment.heights import chosen_datum, control_datum, height_above
@@ -13,6 +13,19 @@ from skyquilt.geometry.frames import angle_difference_deg
 from skyquilt.model.photo import ControlPoint, Photo
 from skyquilt.model.poses import MapFrame, Prior
 from skyquilt.outside import plain
+
+STRETCH_STEP_M = 50.0
+"""Way in m over which a coordinate system's scale is measured."""
+STRETCH_TOLD, STRETCH_REFUSED = 0.005, 0.1
+"""Departure of the scale from one that is told, and of the scale along one direction from that
+across it that is refused: a map cannot hold what photos show then.
+"""
+STRETCH_MOST = 4.0
+"""Scale that is refused, too, as its inverse is: that of Web Mercator at 75 degrees."""
+NORTH_OFF_DEG = 3.0
+"""Departure of north from where a coordinate system should have it that is refused: systems with
+axes west and south are 180 degrees off.
+"""
 
 
 def utm_epsg(latitude_deg: float, longitude_deg: float) -> str:
@@ -34,8 +47,8 @@ def choose_frame(
     georeferenced.
 
     Raises:
-        UsageError: `crs` is unknown, or not projected in metres; or heights cannot be converted to
-            `vertical_datum`.
+        UsageError: `crs` is unknown, not projected in metres, or does not suit the place; or
+            heights cannot be converted to `vertical_datum`.
     """
     places = [(p.position.latitude_deg, p.position.longitude_deg) for p in photos if p.position]
     if not places and control:
@@ -56,6 +69,8 @@ def choose_frame(
     x, y = Transformer.from_crs(4326, name, always_xy=True).transform(longitude, latitude)
     origin = (float(np.round(x, -2)), float(np.round(y, -2)))
     convergence = Proj(name).get_factors(longitude, latitude).meridian_convergence
+    if crs:
+        _check_suits(name, latitude, longitude, convergence)
     datum, takeoff = chosen_datum(photos, control, vertical_datum)
     return MapFrame(
         crs=name,
@@ -98,6 +113,67 @@ def checked_crs(crs: str) -> str:
             f"--crs {crs!r} ({parsed.name}) is not projected in metres; a mosaic needs one that is"
         )
     return crs
+
+
+def stretch(crs: str, latitude: float, longitude: float) -> NDArray[np.float64]:
+    """(2, 2) map coordinates of a way of one metre to the east (first column) and to the north."""
+    to_map, geod = Transformer.from_crs(4326, crs, always_xy=True), CRS(crs).get_geod()
+    here = np.array(to_map.transform(longitude, latitude))
+    ends = [
+        (geod or Geod(ellps="WGS84")).fwd(longitude, latitude, a, STRETCH_STEP_M) for a in (90, 0)
+    ]
+    return np.array([to_map.transform(lon, lat) - here for lon, lat, _ in ends]).T / STRETCH_STEP_M
+
+
+def stretch_warnings(frame: MapFrame) -> list[str]:
+    """A sentence where lengths in the map's coordinate system are not those on the ground."""
+    if frame.crs is None:
+        return []
+    to_wgs = Transformer.from_crs(frame.crs, 4326, always_xy=True)
+    longitude, latitude = to_wgs.transform(*frame.origin)
+    most = _farthest_from_one(stretch(frame.crs, latitude, longitude))
+    if abs(most - 1) <= STRETCH_TOLD:
+        return []
+    return [
+        f"A metre on the ground is {most:.3f} m in {plain(frame.crs, 80)} here, so lengths, areas"
+        " and heights of the map are off by as much; a map in the local UTM zone (without --crs)"
+        " has true ones, and can be exported (skyquilt export --crs)."
+    ]
+
+
+def _farthest_from_one(jacobian: NDArray[np.float64]) -> float:
+    found = np.linalg.svd(jacobian, compute_uv=False)
+    return float(found[np.argmax(np.abs(np.log(found)))])
+
+
+def _check_suits(crs: str, latitude: float, longitude: float, convergence: float) -> None:
+    """Refuses a coordinate system in which no map of this place can be made.
+
+    Raises:
+        UsageError: there, it stretches or turns what is measured, or has no coordinates.
+    """
+    advice = (
+        "leave it out, and convert the finished map (skyquilt export --crs), or choose the system"
+        " of the place"
+    )
+    where = f"--crs {plain(crs, 80)!r} ({plain(CRS(crs).name, 80)})"
+    jacobian = stretch(crs, latitude, longitude)
+    if not np.isfinite(jacobian).all():
+        raise UsageError(
+            f"{where} has no coordinates for {latitude:.2f}, {longitude:.2f}; {advice}"
+        )
+    least, most = sorted(np.linalg.svd(jacobian, compute_uv=False).tolist())
+    if most > (1 + STRETCH_REFUSED) * least or not 1 / STRETCH_MOST < most < STRETCH_MOST:
+        raise UsageError(
+            f"{where} stretches a metre at {latitude:.2f}, {longitude:.2f} to {least:.2f} m one"
+            f" way and to {most:.2f} m the other; {advice}"
+        )
+    north = np.degrees(np.arctan2(*jacobian[:, 1]))
+    if (
+        np.linalg.det(jacobian) < 0
+        or abs(angle_difference_deg(north, -convergence)) > NORTH_OFF_DEG
+    ):
+        raise UsageError(f"{where} has axes that do not point east and north; {advice}")
 
 
 def empty_prior() -> Prior:

@@ -26,6 +26,10 @@ NOMINAL_HEIGHT_M = 50.0
 """Height above ground in m assumed if no data determine the scale; the result is then marked as not
 metric.
 """
+LEAST_BASE = 0.1
+"""Photos whose places in the pictures lie closer than so many deviations of their positions tell no
+scale and no direction.
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -150,7 +154,10 @@ def georeference(
         return scaled, np.nan, metric
     where = position[known]
     spread = float(np.abs(where - where.mean()).max()) if known.sum() > 1 else 0.0
-    if known.sum() >= 2 and spread > 3 * float(np.median(sigma[known])):
+    usual = float(np.median(sigma[known]))
+    shown = np.ptp(solution.t[known].view(float).reshape(-1, 2), axis=0).max()
+    shown *= _scale_by_height(solution.a, priors, ground_m)[0]
+    if known.sum() >= 2 and spread > 3 * usual and shown > LEAST_BASE * usual:
         g, c, scatter = fit_similarity(solution.t[known], where, sigma[known])
         metric = True
     else:

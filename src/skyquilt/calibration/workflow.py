@@ -91,7 +91,7 @@ def iter_calibrate(
         SkyquiltError: any other error that the user can correct.
     """
     frames, output, began = Path(frames), Path(output), Clock.now()
-    if frames.is_dir() and frames.resolve() == output.resolve():
+    if frames.is_dir() and os.path.realpath(frames) == os.path.realpath(output):
         raise UsageError(
             f"{output} contains the frames; choose another folder, such as {output / 'calibration'}"
         )

@@ -139,7 +139,7 @@ def command(
         from skyquilt.engine.memory_watch import MEMORY_GB, ends_run, limit_bytes
         from skyquilt.errors import UsageError
         from skyquilt.live.fill import known_plan
-        from skyquilt.live.folder_watch import create_inbox
+        from skyquilt.live.folder_watch import apart, create_inbox
         from skyquilt.live.live_map import LiveMap
         from skyquilt.live.settings import LiveSettings
         from skyquilt.live.workflow import iter_live
@@ -175,6 +175,7 @@ def command(
     )
     for folder in inbox:
         create_inbox(folder)
+        apart(folder, output)
     live = LiveMap(output, settings)
     try:
         for path in layer or ():

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -119,8 +120,7 @@ def open_run(
     Raises:
         OutputError: it holds something else, another run works in it, or it cannot be written.
     """
-    if path.exists() and not path.is_dir():
-        raise OutputError(f"{path} is a file; the output is a folder")
+    _refuse_file(path)
     known, state = _state(path)
     try:
         taken = (
@@ -159,8 +159,7 @@ def claimed(path: Path, names: Sequence[str], *, overwrite: bool) -> Iterator[No
         OutputError: the folder holds files and `overwrite` is not set, is a file, cannot be
             written, or another run works in it.
     """
-    if path.exists() and not path.is_dir():
-        raise OutputError(f"{path} is a file; the output is a folder")
+    _refuse_file(path)
     try:
         _refuse_files(path, overwrite)
         (path / STATE).mkdir(parents=True, exist_ok=True)
@@ -180,6 +179,12 @@ def claimed(path: Path, names: Sequence[str], *, overwrite: bool) -> Iterator[No
         yield
     finally:
         lock.remove()
+
+
+def _refuse_file(path: Path) -> None:
+    if os.path.lexists(path) and not path.is_dir():
+        what = "a file" if path.exists() else "a link that leads nowhere"
+        raise OutputError(f"{path} is {what}; the output is a folder")
 
 
 def _refuse_files(path: Path, overwrite: bool) -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Generic, Protocol, TypeVar
 
+from skyquilt.engine.memory_watch import enough_addresses
 from skyquilt.model.event import Note
 from skyquilt.settings import RunningSettings
 
@@ -110,9 +111,11 @@ def workers_for(running: RunningSettings, folder: Path, sees: Sequence[Path]) ->
     `sees`: files that all workers must see.
 
     Raises:
-        UsageError: the scheduler or its workers cannot be used.
+        UsageError: the scheduler or its workers cannot be used. SkyquiltError: the system allows
+            too few addresses for so many threads.
     """
     if running.scheduler is None:
+        enough_addresses(running.threads)
         yield Threads(running.threads)
         return
     from skyquilt.engine.cluster import cluster  # Dask is an extra

@@ -45,6 +45,7 @@ def iter_finish(folder: Path, settings: LiveSettings) -> Iterator[Event]:
         shutter_readout_ms=settings.shutter_readout_ms,
         vertical_datum=settings.vertical_datum,
         max_view_angle=settings.max_view_angle,
+        max_mp=settings.most_mp,
     )
     # if the final map is requested again after more photos have arrived, it is made anew; results
     # computed before are reused from the store, and the former map is shown until then

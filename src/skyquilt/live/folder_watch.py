@@ -15,6 +15,7 @@ from skyquilt.live.photo_intake import Accepted, Intake, Refused
 from skyquilt.model.photo import RejectedPhoto
 from skyquilt.outside import open_regular, walk
 from skyquilt.photos.read import read_photo
+from skyquilt.photos.survey import RUN_MARKS
 
 ENDINGS = (".jpg", ".jpeg", ".tif", ".tiff", ".png")
 PARTIAL = (".part", ".partial", ".tmp", ".crdownload", ".filepart")
@@ -63,6 +64,19 @@ def create_inbox(folder: Path) -> None:
         raise UsageError(f"{folder} {why}; name a folder for the photos") from error
 
 
+def apart(inbox: Path, output: Path) -> None:
+    """Refuses a folder of photos that is the folder of the survey.
+
+    Raises:
+        UsageError: it is.
+    """
+    if os.path.realpath(inbox) == os.path.realpath(output):
+        raise UsageError(
+            f"{output} is the folder of the photos, and the map that grows there would be taken for"
+            f" one; choose another folder for the survey, such as {output / 'map'}"
+        )
+
+
 @dataclass(kw_only=True)
 class Watch:
     """Watches a folder and its subfolders. The ledger stores which files were seen, so that a
@@ -76,6 +90,7 @@ class Watch:
     growing: dict[str, Growing] = field(default_factory=dict)
     """Files that are not taken yet, by path."""
     _clips: dict[str, tuple[Stamp, Taking]] = field(default_factory=dict)
+    _closed_folders: dict[Path, str] = field(default_factory=dict)
     _due: float = 0.0
 
     def __post_init__(self) -> None:
@@ -83,6 +98,7 @@ class Watch:
             raise UsageError(
                 f"{self.folder} is not a folder; make it, or name the folder for the photos"
             )
+        apart(self.folder, self.intake.ledger.path.parent)
         known = self.intake.ledger.rows("select path, size, mtime from seen")
         self._seen = {str(p): (int(s), int(m)) for p, s, m in known}
         self._closed = ClosedFiles(folder=self.folder)
@@ -96,7 +112,11 @@ class Watch:
         now = (
             time.monotonic()
         )  # one time for all, so that files that arrived together are taken in order
+        told = set(self._closed_folders)
         self._note(now)
+        for path in sorted(self._closed_folders.keys() - told):
+            reason = f"this folder cannot be read ({self._closed_folders[path]})"
+            yield self.intake.refuse(path.name, self.folder.name, reason)
         for key in sorted(self.growing, key=Path):
             known = self.growing[key]
             if not known.closed and now - known.since < QUIET_S:
@@ -165,7 +185,8 @@ class Watch:
         self, closed: set[str], *, everything: bool, now: float
     ) -> list[tuple[Path, Stamp | None]]:
         """Files to check, with their stamp; None if the file no longer exists."""
-        known = {p for p in map(Path, closed | self.growing.keys()) if _photo_name(p.name)}
+        reported = {p for p in map(Path, closed) if _photo_name(p.name) and not self._of_a_run(p)}
+        known = reported | set(map(Path, self.growing))
         if not self.folder.is_dir():
             self._due = 0.0  # what was reported while it is away is looked for when it is back
         elif everything or now >= self._due:
@@ -176,9 +197,27 @@ class Watch:
         return [(path, _stamp(path)) for path in known]
 
     def _files(self) -> Iterator[Path]:
-        for here, folders, names in walk(self.folder):
+        for here, folders, names in walk(self.folder, self._cannot):
+            if here != self.folder and not RUN_MARKS.isdisjoint((*names, *folders)):
+                folders.clear()
+                continue
             folders[:] = [f for f in folders if not f.startswith(".")]
             yield from (here / name for name in names if _photo_name(name))
+
+    def _of_a_run(self, path: Path) -> bool:
+        """Whether a file lies in the folder of a run or of a live map, such as this one's: the map
+        that grows there is no photo.
+        """
+        for folder in path.parents:
+            if folder == self.folder or self.folder not in folder.parents:
+                return False
+            if any((folder / mark).exists() for mark in RUN_MARKS):
+                return True
+        return False
+
+    def _cannot(self, folder: Path, error: OSError) -> None:
+        if folder.is_dir():  # not one that is gone by now
+            self._closed_folders[folder] = error.strerror or str(error)
 
     def _unfinished(self, path: Path, *, patient: bool) -> str:
         """Why a file cannot be taken (yet); empty where it can. Raises `FileNotFoundError`."""

@@ -1,20 +1,35 @@
 """The first step for a photo: its metadata place it on the map at once."""
 
 import json
+from bisect import bisect_right
 from dataclasses import asdict
+from itertools import islice
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.engine.pixel_cache import PixelCache
+from skyquilt.live.adjustment_schedule import KEY as SCHEDULE
 from skyquilt.live.drone_metadata import Metadata
 from skyquilt.live.events import MapEvents, Update
 from skyquilt.live.ledger import hit
-from skyquilt.live.members import Member, Queues
+from skyquilt.live.members import FAR_M, Member, Queues
 from skyquilt.live.redraw_queue import RedrawQueue
 from skyquilt.ortho.ground import round_gsd
+from skyquilt.outside import whole
+from skyquilt.photos.implausible_positions import on_sphere
 
+FEW = 10
+"""A map with at most so many photos is begun again where more of them lie elsewhere."""
+BEGAN, NO_PLACE = "begun at", "no place told"
+"""Names in the ledger: the photo around which the map was begun again; whether it was said that no
+photo has a position.
+"""
+NOWHERE = (
+    "no photo has a position so far, so nothing is shown: the map begins with the first that has"
+    " one, and the final map (--finish, or the button) needs none"
+)
 ABOVE_M = 50.0
 """Assumed flying height in m where the metadata do not contain one."""
 
@@ -37,23 +52,29 @@ class InitialPose:
 
     def place(self, member: Member) -> Update:
         """Places the photo, which is the first in the queue of received photos."""
-        warning = ""
+        warning, first = "", member
         if self.members.frame is None and member.photo.position is not None:
-            warning = self.metadata.frame_from(member)
+            first = self.members.by_id.get(self._begun_at(), member)
+            warning = self.metadata.frame_from(first)
         if self.members.frame is not None and self.canvas.gsd == 0:
-            self._begin(member, warning)
+            self._begin(first, warning)
+        why = self.members.far_note(member.photo)
         preview = self._preview(member)
         known = preview.pose if preview is not None else None
         pose = known if known is not None else self.metadata.first(member)
         self.pixels(member.id)
         with self.ledger.change():
             member.pose, member.state = pose, "waiting" if pose is None else "placed"
-            self.members.save(member)
+            self.members.save(member, reason=why)
+            if self.members.frame is None and not self.ledger.meta(NO_PLACE):
+                self.ledger.put_meta(NO_PLACE, True)
+                self.ledger.tell("note", {"text": f"{NOWHERE}."})
+                warning = NOWHERE
             if preview is not None:
                 preview.state = "superseded"
                 self.members.save(preview)
                 self.map_events.superseded(preview)
-            self.map_events.photo(member)
+            self.map_events.photo(member, **({"reason": why} if why else {}))
         hit("photo placed")
         if preview is not None:
             self.redraw.gone(preview.id)
@@ -61,7 +82,55 @@ class InitialPose:
         self.queues.untried.append(member)
         if pose is not None:
             self.redraw.show(member)
-        return Update(what=member.state, photo=member.id, text=warning)
+        return Update(what=member.state, photo=member.id, text=warning or why)
+
+    def elsewhere(self, member: Member) -> bool:
+        """Whether the map began in the wrong place, with a photo that was left on the card, say:
+        more photos up to this one lie near it than near the map, which has few. Only a later photo
+        than the one around which it was begun again can tell so once more.
+        """
+        if self.members.distance_m(member.photo) <= FAR_M or member.id <= self._begun_at():
+            return False
+        begun = bisect_right(self.members.near, member.id)
+        if begun > FEW:
+            return False
+        known = (
+            m.photo
+            for m in reversed(self.members.by_id.values())
+            if m.id <= member.id and m.state != "refused" and m.photo.position is not None
+        )
+        xyz = on_sphere(list(islice(known, 2 * FEW + 1)))
+        return int((np.linalg.norm(xyz - xyz[0], axis=1) <= FAR_M).sum()) > begun
+
+    def _begun_at(self) -> int:
+        return whole(self.ledger.meta(BEGAN), 0) or 0
+
+    def begin_again(self, member: Member) -> Update:
+        """Takes everything off the map and puts all photos back into the queue, for a map around
+        this one. Until the change is stored, a restart begins with it again; what is in memory must
+        be read anew afterwards.
+        """
+        far = self.members.distance_m(member.photo) / 1000
+        text = (
+            f"most photos lie {far:.0f} km from where the map began: it is begun again around them"
+        )
+        self.redraw.clear()
+        with self.ledger.change() as db:
+            for table in ("height", "camera", "link"):
+                db.execute(f"delete from {table}")
+            for key in ("frame", "gsd", "cell", "ground", SCHEDULE):
+                db.execute("delete from meta where key = ?", (key,))
+            self.ledger.put_meta(BEGAN, member.id)
+            for m in self.members.by_id.values():
+                if m.state in ("placed", "refined", "waiting"):
+                    m.state = "received"
+                    self.map_events.photo(m, ring=[], at=None)
+                if m.state in ("received", "superseded"):
+                    m.pose, m.camera = None, ""
+                    self.members.save(m, footprint="", reason="", about={})
+            self.ledger.tell("note", {"text": f"{text}."})
+        hit("map begun again")
+        return Update(what="noted", photo=member.id, text=text)
 
     def _preview(self, member: Member) -> Member | None:
         """The preview of the same shot that arrived before this photo; None if there is none."""

@@ -306,6 +306,11 @@ class LiveMap:
         first = self.queues.received[0]
         if first.id % TIDY == 0:
             give_back()
+        if self.initial_pose.elsewhere(first):
+            self.background.stop()
+            update = self.initial_pose.begin_again(first)
+            self._reload()
+            return update
         with concerning(first.id):
             return self.initial_pose.place(first)
 

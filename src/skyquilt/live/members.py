@@ -21,6 +21,7 @@ from skyquilt.model.camera import ADJUSTABLE, PARAMETERS, Camera
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.poses import MapFrame, Motion, Pose, Prior
 from skyquilt.outside import real, whole
+from skyquilt.photos.implausible_positions import on_sphere, sphere
 from skyquilt.photos.read import read_photo
 from skyquilt.photos.shutter import stated_shutter
 
@@ -28,6 +29,10 @@ FISHEYES = "fisheyes"
 """Name in the ledger of the cameras that proved to have a fisheye."""
 MOST_M = 1e9
 """Largest coordinate in the map's frame."""
+FAR_M = 100_000.0
+"""A position farther than this from where the map began is not used: it is that of another flight,
+and the map's projection is bent there.
+"""
 ON_MAP = ("placed", "refined")
 """States of photos that are drawn."""
 
@@ -97,6 +102,9 @@ class Members:
         self.cameras: dict[str, Camera] = {}
         self.fisheyes = _multiples(ledger.meta(FISHEYES))
         self.frame: MapFrame | None = None
+        self.near: list[int] = []
+        """Numbers of the photos with a position near the place where the map began, ascending."""
+        self._began = np.full(3, np.nan)
         self._last = 0
         self._to_map: Transformer | None = None
         self._to_wgs: Transformer | None = None
@@ -114,8 +122,35 @@ class Members:
         self.frame = frame
         self._to_map = Transformer.from_crs(4326, frame.crs, always_xy=True)
         self._to_wgs = Transformer.from_crs(frame.crs, 4326, always_xy=True)
+        longitude, latitude = self._to_wgs.transform(*frame.origin)
+        self._began, self.near = sphere(np.array([[latitude, longitude]]))[0], []
         for member in self.by_id.values():
-            member.prior = photo_prior(member.photo, frame, self._to_map)
+            member.prior = self._prior(member)
+
+    def _prior(self, member: Member) -> Prior:
+        """The prior of a photo in the map's frame; a position far away is not used."""
+        assert self.frame is not None
+        photo = member.photo
+        if self.distance_m(photo) > FAR_M:
+            photo = replace(photo, position=None)
+        elif photo.position is not None:
+            self.near.append(member.id)
+        return photo_prior(photo, self.frame, self._to_map)
+
+    def distance_m(self, photo: Photo) -> float:
+        """Distance in m from a photo's position to where the map began; 0 where one of them is not
+        known.
+        """
+        if photo.position is None:
+            return 0.0
+        return float(np.nan_to_num(np.linalg.norm(on_sphere([photo])[0] - self._began)))
+
+    def far_note(self, photo: Photo) -> str:
+        """Why a photo's position is not used; empty where it is."""
+        distance = self.distance_m(photo)
+        if distance <= FAR_M:
+            return ""
+        return f"its position lies {distance / 1000:.0f} km from the map and is not used"
 
     def take_up(self) -> list[Member]:
         """Photos that were accepted since the last call, in order."""
@@ -156,7 +191,7 @@ class Members:
             )
             if self.frame is not None and state != "refused":
                 with concerning(member.id):
-                    member.prior = photo_prior(photo, self.frame, self._to_map)
+                    member.prior = self._prior(member)
             self.by_id[member.id] = member
             self.block_of[member.id] = member.id
             self.blocks[member.id] = {member.id}

@@ -102,6 +102,17 @@ class RedrawQueue:
         """Removes a photo."""
         _add(self.dirty, self.canvas.remove(number), number)
 
+    def clear(self) -> None:
+        """Takes all photos off the map, and draws every tile that showed one."""
+        self.pending.clear()
+        self._to_draw.clear()
+        for member in self.members.on_map():
+            self.gone(member.id)
+        while self.urgent or self.dirty:
+            self.draw(self.urgent or self.dirty)
+        while self.later:
+            self.draw_newest()
+
     def draw(self, queue: Queue, rule: str = "") -> Update:
         """Draws some of the queued tiles. When the queue is empty, what was drawn is stored and
         reported.

@@ -72,14 +72,15 @@ class Refinement:
             if member.state == "refined":
                 self.local_pose.metadata.learn(member)
                 self.schedule.refined(member.id, loop=far)
-            self.members.save(
-                member, about=about_record(member, change.reason), reason=change.reason
-            )
+            why = change.reason
+            if why and (note := self.members.far_note(member.photo)):
+                why = f"{why}; {note}"
+            self.members.save(member, about=about_record(member, why), reason=why)
             for lost in found:
                 lost.tried, lost.again = 0, self._tried
                 self.members.save(lost, about=about_record(lost, ""))
             self.schedule.write(self.ledger)
-            self.map_events.photo(member, reason=change.reason)
+            self.map_events.photo(member, reason=why)
         hit("photo refined")
         self.local_pose.neighbours.indexed(member)
 
@@ -130,7 +131,7 @@ class Refinement:
 
     def _found(self, member: Member, change: Change) -> list[Member]:
         """Photos without links so far that match this one."""
-        if member.id not in change.moved:
+        if member.id not in change.moved and member.pose is None:
             return []
         lost = [m for m in self.queues.lost if m.photo.band == member.photo.band][-LOST:]
         return [m for m in lost if self._links(m, member)]

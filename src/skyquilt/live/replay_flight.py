@@ -8,6 +8,7 @@ import urllib.parse
 import urllib.request
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from http.client import HTTPException
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ import simplejpeg
 from skyquilt.errors import NoPhotosError, OutputError, UsageError
 from skyquilt.imaging.grey import shrink
 from skyquilt.model.photo import Photo
+from skyquilt.outside import plain
 from skyquilt.photos.headers import APP1, read_jpeg_header
 from skyquilt.photos.pixels import decode_jpeg
 from skyquilt.photos.survey import capture_order, read_survey
@@ -164,10 +166,10 @@ def _copied(folder: Path, name: str, drone: int, data: bytes) -> str:
 def _posted(url: str, name: str, drone: int, data: bytes, token: str | None) -> str:
     query = urllib.parse.urlencode({"name": name, "source": f"drone-{drone}"})
     headers = {"Content-Type": "application/octet-stream"} | ({"X-Token": token} if token else {})
-    request = urllib.request.Request(
-        f"{url.rstrip('/')}/photos?{query}", data=data, headers=headers
-    )
     try:
+        request = urllib.request.Request(
+            f"{url.rstrip('/')}/photos?{query}", data=data, headers=headers
+        )
         with urllib.request.urlopen(request, timeout=60) as answer:
             return f"{answer.status}"
     except urllib.error.HTTPError as error:
@@ -176,5 +178,8 @@ def _posted(url: str, name: str, drone: int, data: bytes, token: str | None) -> 
                 f"{url} accepts no photos from here ({error.read().decode(errors='replace')[:200]})"
             ) from error
         return f"{error.code}"
-    except OSError as error:
-        raise UsageError(f"{url} does not answer ({error}); start 'skyquilt live' first") from error
+    except (OSError, ValueError, HTTPException) as error:  # no address, or no server of ours
+        raise UsageError(
+            f"{plain(url, 200)} does not answer ({plain(str(error), 200)}); start 'skyquilt live'"
+            " first"
+        ) from error

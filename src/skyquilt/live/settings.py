@@ -105,4 +105,7 @@ class LiveSettings:
             "shutter": self.shutter,
             "shutter_readout_ms": self.shutter_readout_ms,
             "max_view_angle": self.max_view_angle,
+            "gsd_cm": self.gsd_cm,
+            "crs": self.crs,
+            "vertical_datum": self.vertical_datum,
         }

@@ -54,6 +54,8 @@ class Surface:
         self, column: NDArray[np.float32], row: NDArray[np.float32]
     ) -> NDArray[np.float32]:
         """Bilinear heights at columns and rows (h, w) of the surface."""
+        if not column.size:
+            return np.zeros(column.shape, np.float32)
         parts = []
         for k in range(0, column.shape[1], 30000):  # remap's maps must stay below 32768 columns
             parts.append(
@@ -65,8 +67,6 @@ class Surface:
                     borderMode=cv2.BORDER_REPLICATE,
                 )
             )
-        if not parts:
-            return np.zeros(column.shape, np.float32)
         if len(parts) == 1:
             return np.asarray(parts[0], np.float32)
         return np.concatenate(parts, 1, dtype=np.float32)

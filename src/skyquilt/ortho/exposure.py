@@ -327,6 +327,8 @@ class Balance:
         point, row, place, value = [], [], [], []
         for index, view in enumerate(views):
             part = _around(view, x[0], y[:, 0])
+            if 0 in x[part].shape:  # it shows none of a small area
+                continue
             nodes = project_nodes(view, x[part], y[part], z[part])
             r, c = np.nonzero(nodes.seen)
             if not len(r):

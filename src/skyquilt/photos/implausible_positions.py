@@ -40,7 +40,7 @@ def without_outliers(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[
     keeps the value: where pictures overlap, they place it.
     """
     if sum(p.position is not None for p in photos) < 3:
-        return tuple(photos), _far_pair([p for p in photos if p.position])
+        return _far_pair(photos)
     main, *others = groups(photos)
     middle = np.median(on_sphere([photos[i] for i in main]), axis=0)
     kept, notes = list(photos), list[str]()
@@ -115,12 +115,19 @@ def _unraised(photo: Photo) -> Photo:
     return replace(photo, position=old)
 
 
-def _far_pair(placed: Sequence[Photo]) -> tuple[str, ...]:
-    """With two positions far apart, one of them is wrong, but it cannot be decided which."""
+def _far_pair(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
+    """With two positions far apart, one of them is wrong, but it cannot be decided which: among
+    other photos, neither is used. The map would lie between them.
+    """
+    placed = [p for p in photos if p.position]
     apart = 2 * float(distances_to_median(placed)[0]) if len(placed) == 2 else 0.0
     if apart <= FAR_M:
-        return ()
-    return (f"{placed[0].name} and {placed[1].name} report positions {apart / 1000:.0f} km apart.",)
+        return tuple(photos), ()
+    told = f"{placed[0].name} and {placed[1].name} report positions {apart / 1000:.0f} km apart"
+    if len(photos) == 2:
+        return tuple(photos), (f"{told}.",)
+    note = f"{told}, and no third one tells which is right: neither is used."
+    return tuple(_unplaced(p, apart) for p in photos), (note,)
 
 
 def _unplaced(photo: Photo, distance_m: float) -> Photo:
@@ -228,7 +235,12 @@ def on_sphere(photos: Sequence[Photo]) -> Array:
     """Positions (n, 3) in m on a sphere, of those photos that have one: distances between them
     do not depend on the pole or on the meridian of 180 degrees.
     """
-    north, east = np.radians(_degrees(photos)).T
+    return sphere(_degrees(photos))
+
+
+def sphere(degrees: Array) -> Array:
+    """Latitudes and longitudes (n, 2) in degrees as places (n, 3) in m on a sphere."""
+    north, east = np.radians(degrees).T
     flat = np.cos(north)
     return _EARTH_M * np.stack([flat * np.cos(east), flat * np.sin(east), np.sin(north)], 1)
 

@@ -2,7 +2,7 @@
 
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import pairwise
@@ -36,8 +36,8 @@ _OTHER_PICTURES = frozenset(
     )
 )
 """Endings of pictures in formats that are not read."""
-_RUN_MARK = "run.toml"
-_RUN_STATE = ".skyquilt"
+RUN_MARKS = frozenset({"run.toml", "live.db", ".skyquilt"})
+"""What the folder of an earlier run or of a live map holds, each one or another of these."""
 _SIDE_NAMES = frozenset({"geo.txt", "gcp_list.txt"})
 
 
@@ -55,14 +55,16 @@ class FoundFiles:
     """A `geo.txt` at the top of the folder."""
     runs: tuple[str, ...]
     """Folders of earlier runs, which are not read."""
+    unread: tuple[str, ...] = ()
+    """Folders that the system does not let be read, each with the reason."""
 
 
 def find_files(source: Path | Sequence[Path]) -> FoundFiles:
     """Finds photos by file name extension in a folder and its subfolders, or among single files.
 
     Hidden files and folders are skipped, and so are folders of earlier runs (they contain
-    `run.toml`, or `.skyquilt` while a run is not finished). Raises `UsageError` where a given path
-    does not exist.
+    `run.toml`, or `.skyquilt` while a run is not finished) and of live maps. Raises `UsageError`
+    where a given path does not exist.
     """
     if isinstance(source, (str, Path)) and Path(source).is_dir():
         return _in_folder(Path(source))
@@ -75,14 +77,23 @@ def find_files(source: Path | Sequence[Path]) -> FoundFiles:
 
 def _in_folder(folder: Path) -> FoundFiles:
     runs: list[str] = []
-    files = [(_text(p.relative_to(folder).as_posix()), p) for p in _walk(folder, runs, folder)]
+    unread: list[str] = []
+
+    def cannot(path: Path, error: OSError) -> None:
+        name = path.relative_to(folder).as_posix() if path != folder else folder.as_posix()
+        unread.append(f"{_text(name)} ({error.strerror or error})")
+
+    found = _walk(folder, runs, folder, cannot)
+    files = [(_text(p.relative_to(folder).as_posix()), p) for p in found]
     geo = next((p for name, p in files if name.lower() == "geo.txt"), None)
-    return _sorted(files, geo, tuple(sorted(runs)))
+    return replace(_sorted(files, geo, tuple(sorted(runs))), unread=tuple(sorted(unread)))
 
 
-def _walk(folder: Path, runs: list[str], top: Path) -> Iterator[Path]:
-    for here, folders, files in walk(folder):
-        if here != top and (_RUN_MARK in files or _RUN_STATE in folders):
+def _walk(
+    folder: Path, runs: list[str], top: Path, unread: Callable[[Path, OSError], None]
+) -> Iterator[Path]:
+    for here, folders, files in walk(folder, unread):
+        if here != top and not RUN_MARKS.isdisjoint((*files, *folders)):
             runs.append(_text(here.relative_to(top).as_posix()))
             folders.clear()
             continue
@@ -95,15 +106,18 @@ def _listed(paths: Sequence[Path]) -> FoundFiles:
     folder.
     """
     files: list[Path] = []
+    unread: list[str] = []
     for path in paths:
         inside = _in_folder(path) if path.is_dir() else None
         files += [p for _, p in (*inside.photos, *inside.clips)] if inside else [path]
+        unread += inside.unread if inside else ()
     unique = list(dict.fromkeys(p.absolute() for p in files))
     top = Path(os.path.commonpath([p.parent for p in unique])) if unique else Path()
     bare = len({p.name for p in unique}) == len(unique)
-    return _sorted(
+    found = _sorted(
         [(_text(p.name if bare else p.relative_to(top).as_posix()), p) for p in unique], None, ()
     )
+    return replace(found, unread=tuple(unread))
 
 
 def _text(name: str) -> str:
@@ -181,6 +195,7 @@ def read_survey(
         notes=(
             *notes,
             *_run_notes(found),
+            *_closed_note(found),
             *_unread_notes(found),
             *implausible,
             *survey_notes(photos, len(copies) + len(reduced)),
@@ -230,6 +245,17 @@ def _run_notes(found: FoundFiles) -> tuple[str, ...]:
     return tuple(f"The folder {run} contains an earlier run and was skipped." for run in found.runs)
 
 
+def _closed_note(found: FoundFiles) -> tuple[str, ...]:
+    """A sentence on folders that cannot be read."""
+    if not found.unread:
+        return ()
+    number = f"{len(found.unread)} folders" if len(found.unread) > 1 else "1 folder"
+    return (
+        f"{number} cannot be read, and photos in there are not in the map:"
+        f" {sentence_of(found.unread)}.",
+    )
+
+
 def _unread_notes(found: FoundFiles) -> tuple[str, ...]:
     """A sentence on pictures in formats that are not read, but for those beside a photo of the same
     name, as cameras write them.
@@ -258,6 +284,8 @@ def _nothing_sentence(
     clips: bool,
 ) -> str:
     where = str(folder) if isinstance(folder, (str, Path)) else f"the {len(folder)} given files"
+    if found.unread and not rejected:
+        return f"There is no photo in {where} that can be found: {_closed_note(found)[0]}"
     if rejected:
         reasons = "; ".join(f"{r.name}: {r.reason}" for r in rejected[:5])
         return (

@@ -84,7 +84,9 @@ class LiveSurvey:
                 )
         for name, final in self._final().items():
             with suppress(OSError, SideFileError):  # it is just being replaced
-                found[name] = self._source(self.folder / FINISHED / final.file)
+                source = self._source(self.folder / FINISHED / final.file)
+                if source.crs:  # else it has no place to be shown at: its files are there
+                    found[name] = source
         return found | self.base
 
     def _source(self, path: Path) -> FileSource:

@@ -18,6 +18,7 @@ from skyquilt.alignment.conflicts import conflicts
 from skyquilt.alignment.contradicted_positions import enlargement_warnings, position_warnings
 from skyquilt.alignment.heights import height_figures
 from skyquilt.alignment.oblique_start import tilt_warnings
+from skyquilt.alignment.priors import stretch_warnings
 from skyquilt.engine.clock import Clock, Steps, result_of
 from skyquilt.engine.error_log import log_error
 from skyquilt.engine.folder import STATE, RunFolder, open_run
@@ -388,6 +389,7 @@ def _metrics(
                 *position_warnings(aligned.priors, alignment),
                 *enlargement_warnings(aligned.priors, alignment),
                 *tilt_warnings(aligned.priors, alignment),
+                *stretch_warnings(alignment.frame),
             ],
             notes=[*survey.notes, *alignment.notes],
         )

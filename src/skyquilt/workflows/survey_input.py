@@ -1,5 +1,6 @@
 """Input of a run: metadata of photos, side files, control points, known distances."""
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -189,7 +190,11 @@ def check_input(given: SurveyInput, output: Path, settings: MosaicSettings) -> N
         UsageError, SideFileError: they do not.
     """
     source = given.source
-    if isinstance(source, Path) and source.is_dir() and source.resolve() == output.resolve():
+    if (
+        isinstance(source, Path)
+        and source.is_dir()
+        and os.path.realpath(source) == os.path.realpath(output)
+    ):
         raise UsageError(
             f"{output} contains the photos; choose another folder for the results, such as"
             f" {output / 'map'}"

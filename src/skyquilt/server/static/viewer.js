@@ -25,7 +25,7 @@ const readInfo = async () => {
 };
 // After the flight: the final map is opened, with its files.
 const openFinal = async () => {
-  if (!state.layers.has("finished")) return;
+  if (!state.layers.has("finished")) return readFiles();  // of photos without positions
   $("layer").value = "finished";
   $("layer").onchange();
   const everywhere = [L.latLngBounds([-90, -180], [90, 180])];
@@ -41,12 +41,15 @@ const explain = () => {
   for (const id of ["export", "fit", "distance", "area", "prints", "tracks"]) $(id).hidden = !some;
   $("layer").parentElement.hidden = !some;
   $("fade").hidden = !some;
-  if (!some) $("finish").hidden = true;
+  const { growing, counts, finish } = state.info, waiting = counts.waiting || 0;
+  if (!some && !waiting) $("finish").hidden = true;
   if (some) return;
-  $("empty").replaceChildren(
-    element("h2", state.info.growing ? "No photo is on the map yet" : "This map has no place on Earth"),
-    element("p", state.info.growing ? "Copy photos into the watched folder, send them over HTTP, or drop them here. The map begins with the first photo that has a position; others wait until they can be linked to it." : "Its photos have no positions. The report shows it."),
-  );
+  const placeless = ["This map has no place on Earth", "Its photos have no positions. The report shows it."];
+  const [head, text] = !growing ? placeless
+    : finish === "done" ? ["The final map has no place on Earth", "Its photos have no positions. It is under Downloads, with its report."]
+    : waiting ? ["No photo has a position so far", "The map begins with the first photo that has one. A flight without any is mapped at its end: Finish flight."]
+    : ["No photo is on the map yet", "Copy photos into the watched folder, send them over HTTP, or drop them here. The map begins with the first photo that has a position; others wait until they can be linked to it."];
+  $("empty").replaceChildren(element("h2", head), element("p", text));
 };
 let again = null;
 const readInfoSoon = () => { if (!again) again = setTimeout(() => { again = null; readInfo().catch(() => {}); }, 400); };
