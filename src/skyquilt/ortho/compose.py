@@ -19,6 +19,8 @@ from skyquilt.ortho.stepped import Closer, Stepped, stepped_heights
 
 PhotoPixels = Callable[[int], NDArray[Any]]
 """Gives the full-size pixels (H, W[, bands]) of a photo by its index."""
+PartPixels = Callable[[int, slice, slice], NDArray[Any]]
+"""Gives the full-size pixels of these rows and columns of a photo (index)."""
 PIECE = 256
 """Pixels of a piece composed at a time."""
 FINE = (4, 8)
@@ -69,6 +71,8 @@ class Composer:
     """Brightness corrections of the photos."""
     labels: Labels | None = None
     """The photo of each place; None = by the blending method's own rule."""
+    parts: PartPixels | None = None
+    """Source of the parts of photos that are drawn; None = `pixels`."""
     detailed: bool = False
     """Whether heights may bend between the nodes of a plan; then nodes are set closer there."""
 
@@ -274,9 +278,10 @@ class Composer:
         """Pixels (h, w, bands) and scores (h, w) of a photo over the area of these nodes; scores
         are zero if photos are not `ranked` by them.
         """
-        image = self.pixels(n.view.photo)
         # cv2.remap uses 16-bit coordinates: a cut-out keeps them small
-        x, y = n.reach(*image.shape[:2])
+        x, y = n.reach(n.view.camera.height, n.view.camera.width)
+        photo = n.view.photo
+        image = self.pixels(photo)[y, x] if self.parts is None else self.parts(photo, y, x)
         u, v = n.pixels(h, w, x, y)
         score = densify(n.score, h, w, n.step) if ranked else np.zeros((h, w), np.float32)
         if not n.seen.all():
@@ -289,7 +294,7 @@ class Composer:
                 u[more], v[more] = su[more], sv[more]
                 within |= more
             np.copyto(score, np.float32(np.inf), where=~within)
-        warped = _remapped(image[y, x], u, v)
+        warped = _remapped(image, u, v)
         return self._exposed(n, warped), score
 
     def _exposed(self, n: Nodes, warped: NDArray[Any]) -> NDArray[Any]:

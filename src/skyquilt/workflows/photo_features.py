@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.engine.clock import Steps
-from skyquilt.engine.pixel_cache import PixelCache
+from skyquilt.engine.pixel_cache import Box, PhotoParts, PixelCache, Step
 from skyquilt.engine.store import Store, digest
 from skyquilt.engine.workers import Workers
 from skyquilt.errors import NoPhotosError, OutputError, PhotoFailedError, UnreadablePhotoError
@@ -130,23 +130,35 @@ class PixelsInUse:
     ) -> None:
         """`number`: the number of each photo in the cache."""
         self._names, self._number = tuple(p.name for p in photos), tuple(number)
+        self._nbytes = sum(
+            p.width * p.height * p.channels * np.dtype(p.dtype).itemsize for p in photos
+        )
         self._cache = cache
 
-    def __call__(self, photo: int) -> NDArray[Any]:
-        """Pixels of a photo (index), read-only.
+    def __call__(self, photo: int, *, once: bool = False) -> NDArray[Any]:
+        """Pixels of a photo (index), read-only. `once`: it is not asked for again soon.
 
         Raises:
             PhotoFailedError: a photo that could be read before is lost.
             MemoryError: there is not enough memory.
         """
         try:
-            return self._cache(self._number[photo])
+            return (self._cache.once if once else self._cache)(self._number[photo])
         except Exception as error:  # whatever it is, it concerns this photo alone
             name = self._names[photo]
             if out_of_memory(error):
                 raise MemoryError(f"it does not suffice to decode {name}") from error
             reason = rejected(name, error).reason
             raise PhotoFailedError(name, f"it could be read before, but now {reason}") from error
+
+    @property
+    def crowded(self) -> bool:
+        """Whether not all photos fit into memory."""
+        return self._cache.dropped > 0 or self._nbytes > self._cache.budget_bytes
+
+    def parts(self, asked: Mapping[int, Mapping[Step, Box]]) -> PhotoParts:
+        """Keeps no more of photos than what steps ask for, by the photo's index."""
+        return PhotoParts(lambda photo: self(photo, once=True), asked, self._cache)
 
     def make_room(self) -> None:
         """Drops the photos kept in memory where not all fit."""
