@@ -32,6 +32,8 @@ the search of heights.
 """
 KEPT_BYTES = 150_000_000
 """Bytes of grey images, and of features, kept in memory; the others are read from the store."""
+MOST_LONGEST = 2**20
+"""More px than grey images are asked for: images of several sizes are kept together."""
 PhotoPixels = Callable[[int], NDArray[Any]]
 """Full-size pixels of a photo by its index."""
 FRAMES = "looks"
@@ -171,8 +173,10 @@ class GreyPictures:
     def __init__(self, photos: Sequence[Photo], pixels: PhotoPixels, store: Store) -> None:
         self._photos, self._pixels, self._store = photos, pixels, store
         self._cache = PixelCache(read=self._load, budget_bytes=KEPT_BYTES)
-        self._small = PixelCache(read=self._shrunken, budget_bytes=KEPT_BYTES // 3)
-        self._longest = 0
+        self._small = PixelCache(
+            read=lambda key: self._shrunken(*divmod(key, MOST_LONGEST)),
+            budget_bytes=KEPT_BYTES // 3,
+        )
 
     def __call__(self, photo: int, longest: int) -> NDArray[np.uint8]:
         """Grey image of a photo (index), with at most `longest` px on its longest side. Those of
@@ -180,18 +184,15 @@ class GreyPictures:
         """
         if longest == PICTURE:
             return self._cache(photo)
-        if longest != self._longest:
-            self._small.clear()
-            self._longest = longest
-        return self._small(photo)
+        return self._small(photo * MOST_LONGEST + longest)
 
     def make_room(self) -> None:
         """Drops the images kept in memory where not all fit."""
         self._cache.make_room()
         self._small.make_room()
 
-    def _shrunken(self, photo: int) -> NDArray[np.uint8]:
-        longest, own = self._longest, self._photos[photo]
+    def _shrunken(self, photo: int, longest: int) -> NDArray[np.uint8]:
+        own = self._photos[photo]
         if longest > PICTURE and max(own.width, own.height) > PICTURE:
             return self._store.get_or(
                 "pictures",
