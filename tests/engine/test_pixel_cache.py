@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skyquilt.engine import pixel_cache
-from skyquilt.engine.pixel_cache import PixelCache
+from skyquilt.engine.pixel_cache import PhotoParts, PixelCache
 
 
 def cache(budget, read=None):
@@ -139,3 +139,52 @@ def test_what_is_asked_for_once_is_not_kept_where_not_all_fit():
     assert full.once(3) is full.peek(3)
     full.make_room()
     assert full.once(3)[0] == 3 and full.peek(3) is None
+
+
+def photo(number):
+    """20 rows and 30 columns, each pixel with a value of its own."""
+    return (1000 * number + np.arange(600)).reshape(20, 30)
+
+
+def parts_of(asked, budget=10**6):
+    read = []
+
+    def decode(number):
+        read.append(number)
+        return photo(number)
+
+    return PhotoParts(decode, asked, cache(budget)), read
+
+
+def test_of_a_photo_only_what_steps_still_ask_for_is_kept():
+    early, late = (slice(0, 4), slice(0, 5)), (slice(6, 10), slice(10, 20))
+    parts, read = parts_of({7: {(0, 0): early, (0, 1): late}})
+    assert np.array_equal(parts(7, *early), photo(7)[early])
+    assert parts._kept.peek(7).pixels.shape == (10, 20)
+    parts.done((0, 0))
+    assert parts._kept.peek(7).pixels.shape == (4, 10)
+    assert np.array_equal(parts(7, slice(7, 9), slice(11, 20)), photo(7)[7:9, 11:20])
+    with pytest.raises(ValueError, match="read-only"):
+        parts(7, *late)[0, 0] = 1
+    parts.done((0, 1))
+    assert parts._kept.peek(7) is None and read == [7]
+
+
+@pytest.mark.parametrize("asked", [{}, {7: {(0, 0): (slice(0, 4), slice(0, 5))}}])
+def test_what_was_not_foreseen_is_decoded_again_and_then_kept(asked):
+    parts, read = parts_of(asked)
+    for box in (
+        (slice(0, 4), slice(0, 5)),
+        (slice(2, 12), slice(3, 9)),
+        (slice(0, 12), slice(0, 9)),
+    ):
+        assert np.array_equal(parts(7, *box), photo(7)[box])
+    assert read == ([7, 7] if asked else [7])
+
+
+def test_parts_give_way_to_others_within_the_budget():
+    box = (slice(0, 10), slice(0, 10))
+    parts, read = parts_of({i: {(0, 0): box} for i in range(4)}, budget=2 * 800)
+    for i in (0, 1, 0, 2, 0, 1):
+        parts(i, *box)
+    assert read == [0, 1, 2, 1] and parts._kept._bytes == 2 * 800

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from skyquilt.geometry.camera import project, undistort
-from skyquilt.imaging.nodes import STEP, inside, node_places, project_nodes
+from skyquilt.imaging.nodes import STEP, cut, inside, node_places, project_nodes
 from skyquilt.imaging.registration import shifts_between
 from skyquilt.live.tile_drawing import Newest
 from skyquilt.model.poses import Motion
@@ -18,7 +18,7 @@ from skyquilt.model.surface import Surface
 from skyquilt.ortho.blend import Average, Feather, First, Multiband
 from skyquilt.ortho.compose import _remapped
 from skyquilt.ortho.plan import STILL
-from skyquilt.ortho.stepped import stepped_heights
+from skyquilt.ortho.stepped import Closer, Part, lifted, stepped_heights
 from tests.ortho.scenes import CAMERA, FLAT, GRID, block, composer, photograph, truth, view
 
 WHOLE = Window(row=0, column=0, height=GRID.height, width=GRID.width)
@@ -418,12 +418,44 @@ def test_pixels_at_stepping_heights_lie_where_they_are_projected(moving):
     )
     stepped = stepped_heights(GRID, rough, place, [shot])
     assert stepped is not None
-    nodes = stepped.lifted(project_nodes(shot, *node_places(GRID, rough, place)), 0, 0, 256, 200)
+    flat = project_nodes(shot, *node_places(GRID, rough, place))
+    (nodes,) = lifted([(Part(nodes=flat, row=0, column=0, height=256, width=200), stepped)])
     found = nodes.pixels(256, 200, slice(0, 9), slice(0, 9))
     x, y = GRID.x(place.column + np.arange(200)), GRID.y(place.row + np.arange(256))
     exact = project_nodes(shot, *np.meshgrid(x, y), rough.on(x, y))
     off = np.hypot(found[0] - exact.u, found[1] - exact.v)[exact.seen]
     assert len(off) > 5000 and off.max() < 0.1
+
+
+def test_parts_of_several_photos_are_each_projected_on_their_own_heights():
+    rough = Surface(
+        z=np.random.default_rng(6).uniform(-2, 12, (90, 90)).astype(np.float32),
+        x0=-24.0,
+        y0=-24.0,
+        cell=0.5,
+        source="t",
+    )
+    parts = []
+    for k, shot in enumerate([view(0, 14, 9, yaw=30), view(4, -3, 2, pitch=12)] * 2):
+        place = Window(row=32 * k, column=64, height=128, width=96)
+        stepped = stepped_heights(GRID, rough, place, [shot])
+        assert stepped is not None
+        closer = Closer(**dict(zip("xyz", node_places(GRID, rough, place, 4), strict=True)), step=4)
+        flat = project_nodes(shot, *node_places(GRID, rough, place))
+        inner = cut(flat, 16, 32, 100, 60)
+        own = Part(nodes=inner, row=16, column=32, height=100, width=60)
+        parts += [(own, finer) for finer in (stepped, closer, None)]
+    for (part, finer), n in zip(parts, lifted(parts), strict=True):
+        if finer is None:
+            assert n is part.nodes
+            continue
+        exact = project_nodes(part.nodes.view, *finer.places(part))
+        u, v = (n.u, n.v) if n.levels is None else n.levels
+        assert np.abs(u - exact.u).max() < 1e-3 and np.abs(v - exact.v).max() < 1e-3
+        seen = exact.seen if n.levels is None else exact.seen.all(0) & part.nodes.seen
+        assert np.array_equal(n.seen, seen)
+        if n.levels is not None:
+            assert np.array_equal(n.rise, finer.rise[:, 16:116, 32:92])
 
 
 def test_nothing_to_see():

@@ -2,17 +2,26 @@
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skyquilt.engine.memory_watch import resident_bytes
 from skyquilt.settings import USUAL_GB
 
 LEAST_BYTES = 150_000_000
 """Bytes of decoded photos that are kept whatever else is in memory."""
+MOST_OF = 0.8
+"""Share of what is held from which it is not worth a copy to hold less."""
+Box = tuple[slice, slice]
+"""Rows and columns of a photo."""
+Step = tuple[int, int]
+"""Name of a step of a work: the place of what is drawn."""
+UNFORESEEN: Step = (-1, -1)
+"""Stands for all steps, for what they ask for beyond what was said."""
 
 
 class HasBytes(Protocol):
@@ -110,6 +119,12 @@ class PixelCache(Generic[Kept]):
         with self._lock:
             return self._kept.get(photo)
 
+    def drop(self, photo: int) -> None:
+        """Drops one photo, if it is kept."""
+        with self._lock:
+            if (held := self._kept.pop(photo, None)) is not None:
+                self._bytes -= held.nbytes
+
     def make_room(self) -> None:
         """Drops all photos unless every one fitted so far: of a survey that does not fit, few of
         those that are kept are asked for again before they would be dropped.
@@ -122,6 +137,103 @@ class PixelCache(Generic[Kept]):
         with self._lock:
             self._kept.clear()
             self._bytes = 0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Part:
+    """A part of a photo."""
+
+    pixels: NDArray[Any]
+    """(h, w[, bands])."""
+    row: int
+    """Row of the photo that is the first."""
+    column: int
+    """Column of the photo that is the first."""
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes in memory."""
+        return int(self.pixels.nbytes)
+
+    def within(self, rows: slice, columns: slice) -> NDArray[Any] | None:
+        """Rows and columns of the photo; None where the part does not hold all of them."""
+        top, left = rows.start - self.row, columns.start - self.column
+        bottom, right = rows.stop - self.row, columns.stop - self.column
+        h, w = self.pixels.shape[:2]
+        inside = top >= 0 and left >= 0 and bottom <= h and right <= w
+        return self.pixels[top:bottom, left:right] if inside else None
+
+    def cut(self, box: Box) -> "_Part":
+        """A copy of what it holds of a box; itself where that is nearly all of it."""
+        top, left = (
+            max(s.start - at, 0) for s, at in zip(box, (self.row, self.column), strict=True)
+        )
+        pixels = self.pixels[top : box[0].stop - self.row, left : box[1].stop - self.column]
+        if pixels.size > MOST_OF * self.pixels.size:
+            return self
+        pixels = pixels.copy()
+        pixels.setflags(write=False)
+        return _Part(pixels=pixels, row=self.row + top, column=self.column + left)
+
+
+class PhotoParts:
+    """The parts of decoded photos that the steps of a work still ask for, within a memory budget.
+    Thread-safe.
+    """
+
+    def __init__(
+        self,
+        read: Callable[[int], NDArray[Any]],
+        asked: Mapping[int, Mapping[Step, Box]],
+        like: PixelCache[NDArray[Any]],
+    ) -> None:
+        """`read` decodes a photo by its index; `asked`: what each step asks for of each photo,
+        about. `like`: a cache of whole photos with the same budget.
+        """
+        self._read = read
+        self._asked = {photo: dict(steps) for photo, steps in asked.items()}
+        self._shows: dict[Step, list[int]] = {}
+        for photo, steps in asked.items():
+            for step in steps:
+                self._shows.setdefault(step, []).append(photo)
+        self._kept = PixelCache(
+            read=self._cut, budget_bytes=like.budget_bytes, resident_bytes=like.resident_bytes
+        )
+
+    def __call__(self, photo: int, rows: slice, columns: slice) -> NDArray[Any]:
+        """Pixels of these rows and columns of a photo, read-only."""
+        while (found := self._kept(photo).within(rows, columns)) is None:
+            more = self._asked.setdefault(photo, {})
+            more[UNFORESEEN] = _around([(rows, columns), *more.values()])
+            self._kept.drop(photo)
+        return found
+
+    def done(self, step: Step) -> None:
+        """Drops what only this step asked for."""
+        for photo in self._shows.get(step, ()):
+            asked = self._asked[photo]
+            asked.pop(step, None)
+            if not asked.keys() - {UNFORESEEN}:
+                self._kept.drop(photo)
+            elif (held := self._kept.peek(photo)) is not None:
+                part = held.cut(_around([*asked.values()]))
+                if part is not held:
+                    self._kept.put(photo, part)
+
+    def _cut(self, photo: int) -> _Part:
+        whole = self._read(photo)
+        part = _Part(pixels=whole, row=0, column=0)
+        asked = self._asked.get(photo)
+        return part.cut(_around([*asked.values()])) if asked else part
+
+
+def _around(boxes: Sequence[Box]) -> Box:
+    """The rows and columns around boxes."""
+    rows, columns = (
+        slice(min(s.start for s in side), max(s.stop for s in side))
+        for side in zip(*boxes, strict=True)
+    )
+    return rows, columns
 
 
 def pixel_budget(memory_gb: float | None) -> int:

@@ -1,6 +1,6 @@
 """Composition of a window of the map from the photos that cover it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,10 +15,12 @@ from skyquilt.ortho.blend import Blend, Layer
 from skyquilt.ortho.exposure import NEUTRAL, Exposure, image_place, with_odds
 from skyquilt.ortho.labels import Labels
 from skyquilt.ortho.plan import Plan, planned, stale
-from skyquilt.ortho.stepped import Closer, Stepped, stepped_heights
+from skyquilt.ortho.stepped import Closer, Finer, Part, Stepped, lifted, stepped_heights
 
 PhotoPixels = Callable[[int], NDArray[Any]]
 """Gives the full-size pixels (H, W[, bands]) of a photo by its index."""
+PartPixels = Callable[[int, slice, slice], NDArray[Any]]
+"""Gives the full-size pixels of these rows and columns of a photo (index)."""
 PIECE = 256
 """Pixels of a piece composed at a time."""
 FINE = (4, 8)
@@ -48,6 +50,18 @@ class Composed:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class _Draft:
+    """What a piece is drawn from."""
+
+    place: Window
+    """Its place in the map."""
+    parts: Sequence[tuple[Part, Finer | None]]
+    """What each photo is drawn over, and finer heights."""
+    near: Sequence[NDArray[np.bool_]]
+    """(r, c) per photo: the cells in which it can be visible."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Composer:
     """Composes windows of a map."""
 
@@ -69,6 +83,8 @@ class Composer:
     """Brightness corrections of the photos."""
     labels: Labels | None = None
     """The photo of each place; None = by the blending method's own rule."""
+    parts: PartPixels | None = None
+    """Source of the parts of photos that are drawn; None = `pixels`."""
     detailed: bool = False
     """Whether heights may bend between the nodes of a plan; then nodes are set closer there."""
 
@@ -104,9 +120,13 @@ class Composer:
             out.fill(np.nan)
         photo = np.full((window.height, window.width), -1, np.int32)
         for row in range(0, window.height, PIECE):
-            for column in range(0, window.width, PIECE):
-                h, w = min(PIECE, window.height - row), min(PIECE, window.width - column)
-                merged = self._piece(plan, row, column, h + 2 * margin, w + 2 * margin)
+            h = min(PIECE, window.height - row)
+            widths = [
+                (column, min(PIECE, window.width - column))
+                for column in range(0, window.width, PIECE)
+            ]
+            boxes = [(row, column, h + 2 * margin, w + 2 * margin) for column, w in widths]
+            for (column, w), merged in zip(widths, self._pieces(plan, boxes), strict=True):
                 if merged is not None:
                     inner = (slice(margin, margin + h), slice(margin, margin + w))
                     out[row : row + h, column : column + w] = merged[0][inner]
@@ -129,10 +149,8 @@ class Composer:
             )
             h, w = rows.stop - rows.start, columns.stop - columns.start
             empty = np.nan if self.dtype.kind == "f" else 0
-            new, lead = self._piece(plan, rows.start, columns.start, h, w, changed) or (
-                empty,
-                np.int32(-1),
-            )
+            box = (rows.start, columns.start, h, w)
+            new, lead = next(self._pieces(plan, [box], changed)) or (empty, np.int32(-1))
             where = changed.repeat(STEP, 0).repeat(STEP, 1)[rows, columns]
             np.copyto(out[rows, columns], new, where=where[..., None], casting="unsafe")
             np.copyto(photo[rows, columns], lead, where=where)
@@ -146,20 +164,26 @@ class Composer:
             count += n.seen[k + 1 : k + 1 + rows, k + 1 : k + 1 + columns]
         return count
 
-    def _piece(
+    def _pieces(
         self,
         plan: Plan,
-        row: int,
-        column: int,
-        h: int,
-        w: int,
+        boxes: Sequence[tuple[int, int, int, int]],
         wanted: NDArray[np.bool_] | None = None,
-    ) -> tuple[NDArray[Any], NDArray[np.int32]] | None:
-        """Pixels (h, w, bands) and leading photo (h, w) of a piece that starts at a row and column
-        of the nodes' window.
+    ) -> Iterator[tuple[NDArray[Any], NDArray[np.int32]] | None]:
+        """Pixels (h, w, bands) and leading photo (h, w) of each piece: first row and column of the
+        nodes' window, height and width. None where no photo is visible.
 
         `wanted`: (r, c) cells of the window that are needed; None = all.
         """
+        drafts = [self._draft(plan, *box, wanted) for box in boxes]
+        found = iter(lifted([part for d in drafts if d is not None for part in d.parts]))
+        for d in drafts:
+            yield None if d is None else self._merged(d, [next(found) for _ in d.parts])
+
+    def _draft(
+        self, plan: Plan, row: int, column: int, h: int, w: int, wanted: NDArray[np.bool_] | None
+    ) -> _Draft | None:
+        """What a piece is drawn from; None where no photo is visible."""
         cells = (
             slice(row // STEP + 1, (row + h - 1) // STEP + 2),
             slice(column // STEP + 1, (column + w - 1) // STEP + 2),
@@ -173,7 +197,6 @@ class Composer:
         chosen = [(n, here) for n, here in zip(plan.nodes, near, strict=True) if here.any()]
         if not chosen:
             return None
-        alone = len(chosen) == 1
         place = Window(
             row=plan.window.row - plan.margin + row,
             column=plan.window.column - plan.margin + column,
@@ -182,14 +205,31 @@ class Composer:
         )
         cuts = [cut(n, row, column, h, w) for n, _ in chosen]
         finer = self._stepped(place, cuts) or self._closer(plan, cuts, row, column, place)
-        if alone:
-            n = cuts[0] if finer is None else finer.lifted(cuts[0], 0, 0, h, w)
+        if len(cuts) == 1:
+            # the whole piece, in case that this photo covers all of it
+            parts = [Part(nodes=cuts[0], row=0, column=0, height=h, width=w)]
+        else:
+            parts = [_part(n, here, place) for n, (_, here) in zip(cuts, chosen, strict=True)]
+        return _Draft(
+            place=place, parts=[(part, finer) for part in parts], near=[here for _, here in chosen]
+        )
+
+    def _merged(
+        self, draft: _Draft, nodes: Sequence[Nodes]
+    ) -> tuple[NDArray[Any], NDArray[np.int32]]:
+        """Pixels (h, w, bands) and leading photo (h, w) of a piece; `nodes`: of its parts."""
+        place, parts = draft.place, draft.parts
+        if alone := len(parts) == 1:
+            n, size = nodes[0], (place.height, place.width)
             if n.seen.all():  # nothing to blend, whatever the method
-                pixels, _ = self._warped(n, h, w, ranked=False)
-                return pixels, np.full((h, w), n.view.photo, np.int32)
+                pixels, _ = self._warped(n, *size, ranked=False)
+                return pixels, np.full(size, n.view.photo, np.int32)
+            whole, finer = parts[0]
+            parts = [(_part(whole.nodes, draft.near[0], place), finer)]
+            nodes = lifted(parts)
         layers = [
-            self._layer(n, here, place, finer, alone=alone)
-            for n, (_, here) in zip(cuts, chosen, strict=True)
+            self._layer(n, part, place, alone=alone)
+            for n, (part, _) in zip(nodes, parts, strict=True)
         ]
         return self.blend.merge(layers, self.grid.gsd)
 
@@ -232,29 +272,16 @@ class Composer:
         aside = max(float(n.score.max()) for n in cuts)
         return bool(height_m * np.sqrt(aside) > BENT * self.grid.gsd)
 
-    def _layer(
-        self,
-        n: Nodes,
-        near: NDArray[np.bool_],
-        place: Window,
-        finer: Stepped | Closer | None,
-        *,
-        alone: bool,
-    ) -> Layer:
-        """One photo over a piece at its place in the map; filled only within the bounding box of
-        the cells where it can be visible.
-        """
+    def _layer(self, n: Nodes, part: Part, place: Window, *, alone: bool) -> Layer:
+        """One photo over a piece at its place in the map, filled only within the part."""
         h, w = place.height, place.width
-        rows, columns = _extent(np.asarray(near.any(1)), h), _extent(np.asarray(near.any(0)), w)
-        size = rows.stop - rows.start, columns.stop - columns.start
-        n = cut(n, rows.start, columns.start, *size)
-        if finer is not None:
-            n = finer.lifted(n, rows.start, columns.start, *size)
+        size = part.height, part.width
         width = None if self.labels is None or alone else self.blend.seam_px
         pixels, score = self._warped(n, *size, ranked=width is None and not alone)
         if size != (h, w):
-            pixels = _embedded(pixels, 0, rows, columns, h, w)
-            score = _embedded(score, np.inf, rows, columns, h, w)
+            at = slice(part.row, part.row + size[0]), slice(part.column, part.column + size[1])
+            pixels = _embedded(pixels, 0, *at, h, w)
+            score = _embedded(score, np.inf, *at, h, w)
         slope = None
         if self.labels is not None and width is not None:
             score += 1 - self.labels.share(n.view.photo, place, width)
@@ -274,9 +301,10 @@ class Composer:
         """Pixels (h, w, bands) and scores (h, w) of a photo over the area of these nodes; scores
         are zero if photos are not `ranked` by them.
         """
-        image = self.pixels(n.view.photo)
         # cv2.remap uses 16-bit coordinates: a cut-out keeps them small
-        x, y = n.reach(*image.shape[:2])
+        x, y = n.reach(n.view.camera.height, n.view.camera.width)
+        photo = n.view.photo
+        image = self.pixels(photo)[y, x] if self.parts is None else self.parts(photo, y, x)
         u, v = n.pixels(h, w, x, y)
         score = densify(n.score, h, w, n.step) if ranked else np.zeros((h, w), np.float32)
         if not n.seen.all():
@@ -289,7 +317,7 @@ class Composer:
                 u[more], v[more] = su[more], sv[more]
                 within |= more
             np.copyto(score, np.float32(np.inf), where=~within)
-        warped = _remapped(image[y, x], u, v)
+        warped = _remapped(image, u, v)
         return self._exposed(n, warped), score
 
     def _exposed(self, n: Nodes, warped: NDArray[Any]) -> NDArray[Any]:
@@ -318,6 +346,20 @@ def _remapped(image: NDArray[Any], u: NDArray[np.float32], v: NDArray[np.float32
         return np.asarray(cv2.cvtColor(warped, cv2.COLOR_RGBA2RGB))
     warped = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(warped).reshape(*u.shape, -1)
+
+
+def _part(nodes: Nodes, near: NDArray[np.bool_], place: Window) -> Part:
+    """The bounding box of the cells (r, c) of a piece in which a photo can be visible."""
+    rows = _extent(np.asarray(near.any(1)), place.height)
+    columns = _extent(np.asarray(near.any(0)), place.width)
+    size = rows.stop - rows.start, columns.stop - columns.start
+    return Part(
+        nodes=cut(nodes, rows.start, columns.start, *size),
+        row=rows.start,
+        column=columns.start,
+        height=size[0],
+        width=size[1],
+    )
 
 
 def _extent(needed: NDArray[np.bool_], size: int) -> slice:

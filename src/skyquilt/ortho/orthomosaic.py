@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from skyquilt.alignment.heights import VERTICAL_EPSG
 from skyquilt.engine.clock import Steps
 from skyquilt.engine.folder import STATE
+from skyquilt.engine.pixel_cache import PhotoParts
 from skyquilt.engine.store import Store, digest
 from skyquilt.engine.workers import Workers
 from skyquilt.errors import UsageError
@@ -31,7 +32,7 @@ from skyquilt.ortho.companions import (
     provenance_step,
     shot_numbers,
 )
-from skyquilt.ortho.compose import Composer, PhotoPixels
+from skyquilt.ortho.compose import Composer, PartPixels, PhotoPixels
 from skyquilt.ortho.earlier import Growth
 from skyquilt.ortho.exposure import Exposure
 from skyquilt.ortho.former_files import FormerBlock, FormerFiles
@@ -56,6 +57,7 @@ def composer(
     labels: Labels | None,
     blend: Blend,
     pixels: PhotoPixels,
+    parts: PartPixels | None = None,
 ) -> Composer:
     """The composer of a survey's map; all photos have pixels of one kind."""
     return Composer(
@@ -68,6 +70,7 @@ def composer(
         dtype=np.dtype(dtype),
         exposure=exposure,
         labels=labels,
+        parts=parts,
         detailed=True,
     )
 
@@ -140,6 +143,8 @@ class Drawing:
     """Keeps what lies beside the map, by block."""
     key: str
     """What the map depends on (`map_key`)."""
+    parts: PhotoParts | None = None
+    """Where the composer takes parts of photos from; its steps are the corners of blocks."""
     growth: Growth | None = None
     """The earlier map that it continues: blocks away from what changed are those of its files."""
 
@@ -154,6 +159,8 @@ class Drawing:
             stay = self._staying(todo)
             kept = self._former(stay, spec)
             drawn = workers.each(one, [b for b in todo if b not in stay])
+            for block in {*_blocks(spec)} - {*todo}:
+                self._leave(block)
             for done, block in enumerate(todo):  # in this order few overview tiles are open
                 if block in stay:
                     former = next(kept)
@@ -162,6 +169,7 @@ class Drawing:
                 else:
                     (pixels, valid, extras), encoded = next(drawn), None
                 self.store.put("blocks", self._block_key(block), extras)
+                self._leave(block)
                 writer.write_block(block, pixels, valid, encoded)
                 yield total - len(todo) + done + 1, total
         self.store.put("blocks", digest(self.key, "file"), _stamp(path))
@@ -175,6 +183,11 @@ class Drawing:
             return {}  # its provenance is too fine for the grown map
         found = ((b, grows.stays(_window(b), grid)) for b in todo)
         return {b: old for b, old in found if old is not None}
+
+    def _leave(self, block: Block) -> None:
+        """Makes room for what later blocks show."""
+        if self.parts is not None:
+            self.parts.done((block.row0, block.col0))
 
     def _former(self, stay: Mapping[Block, Window], spec: RasterSpec) -> Iterator[FormerBlock]:
         """These blocks, from the files of the earlier map."""

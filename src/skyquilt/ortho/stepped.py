@@ -8,6 +8,7 @@ between are interpolated, at a fraction of the cost of projecting each map pixel
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,67 @@ from numpy.typing import NDArray
 from skyquilt.imaging.nodes import STEP, Nodes, View, inside, node_places, project_nodes, projected
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
+
+Places = tuple[NDArray[Any], NDArray[Any], NDArray[Any]]
+"""Eastings, northings and heights in m, of one shape."""
+
+
+class Finer(Protocol):
+    """Heights of a piece of the map that are finer than the nodes of a plan."""
+
+    def places(self, part: "Part") -> Places:
+        """The places of a part that are projected into the photo."""
+
+    def seen(self, view: View, places: Places) -> Sequence[NDArray[Any]]:
+        """How a photo sees places, for `placed`."""
+
+    def placed(self, part: "Part", seen: Sequence[NDArray[Any]]) -> Nodes:
+        """The nodes of a part on these heights, from how its places are seen."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Part:
+    """A photo over a part of a piece of the map."""
+
+    nodes: Nodes
+    """The nodes of the part."""
+    row: int
+    """First row in the piece, a multiple of STEP."""
+    column: int
+    """First column, a multiple of STEP."""
+    height: int
+    """Rows in px."""
+    width: int
+    """Columns in px."""
+
+    def of(self, step: int) -> tuple[slice, slice]:
+        """Rows and columns of the part's nodes among those of the piece, `step` px apart."""
+        rows, columns = (
+            slice(at // step, at // step - (-size // step) + 2)
+            for at, size in ((self.row, self.height), (self.column, self.width))
+        )
+        return rows, columns
+
+
+def lifted(parts: Sequence[tuple[Part, Finer | None]]) -> list[Nodes]:
+    """The nodes of parts of pieces, on their finer heights if they have any. A photo is projected
+    once for all its parts, in a fraction of the time.
+    """
+    out = [part.nodes for part, _ in parts]
+    alike: dict[tuple[int, type], list[tuple[int, Part, Finer]]] = {}
+    for k, (part, finer) in enumerate(parts):
+        if finer is not None:
+            alike.setdefault((part.nodes.view.photo, type(finer)), []).append((k, part, finer))
+    for own in alike.values():
+        places = [finer.places(part) for _, part, finer in own]
+        x, y, z = (np.concatenate([p[axis].ravel() for p in places]) for axis in range(3))
+        _, part, finer = own[0]
+        seen = finer.seen(part.nodes.view, (x, y, z))
+        start = 0
+        for (k, part, finer), (x, _, _) in zip(own, places, strict=True):
+            its = [found[start : start + x.size].reshape(x.shape) for found in seen]
+            out[k], start = finer.placed(part, its), start + x.size
+    return out
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -30,15 +92,22 @@ class Closer:
     step: int
     """Map pixels between them."""
 
-    def lifted(self, n: Nodes, row: int, column: int, h: int, w: int) -> Nodes:
-        """Nodes of a part (h, w) of the piece, which begins at a multiple of STEP px, replaced by
-        the closer ones.
-        """
-        at = tuple(
-            slice(k // self.step, k // self.step - (-size // self.step) + 2)
-            for k, size in ((row, h), (column, w))
+    def places(self, part: Part) -> Places:
+        """The closer nodes."""
+        at = part.of(self.step)
+        return self.x[at], self.y[at], self.z[at]
+
+    def seen(self, view: View, places: Places) -> Sequence[NDArray[Any]]:
+        """All that `Nodes` hold."""
+        n = project_nodes(view, *places)
+        return n.u, n.v, n.score, n.room, n.seen, n.real
+
+    def placed(self, part: Part, seen: Sequence[NDArray[Any]]) -> Nodes:
+        """The closer nodes."""
+        u, v, score, room, within, real = seen
+        return replace(
+            part.nodes, u=u, v=v, score=score, room=room, seen=within, real=real, step=self.step
         )
-        return replace(project_nodes(n.view, self.x[at], self.y[at], self.z[at]), step=self.step)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -59,24 +128,29 @@ class Stepped:
         """Difference in m between the greatest and the least height."""
         return float(self.levels[2, 0, 0] - self.levels[0, 0, 0])
 
-    def lifted(self, n: Nodes, row: int, column: int, h: int, w: int) -> Nodes:
-        """Nodes of a part (h, w) of the piece, which begins at a multiple of STEP px, with the
-        places of its pixels at their heights. They are unchanged if the photo was placed in the
-        plane, or if a level is not in front of the camera or its distortion folds back there.
+    def places(self, part: Part) -> Places:
+        """The nodes at each level, (3, r, c)."""
+        at = part.of(STEP)
+        x, y, z = np.broadcast_arrays(self.x[at], self.y[at], self.levels)
+        return x, y, z
+
+    def seen(self, view: View, places: Places) -> Sequence[NDArray[Any]]:
+        """Photo columns and rows, and which are real."""
+        return projected(view, *places)
+
+    def placed(self, part: Part, seen: Sequence[NDArray[Any]]) -> Nodes:
+        """The nodes, with the places of the pixels at their heights. They are unchanged if the
+        photo was placed in the plane, or if a level is not in front of the camera or its distortion
+        folds back there.
         """
-        if n.view.pose.cam_H_map is not None:
+        (u, v, real), n = seen, part.nodes
+        if n.view.pose.cam_H_map is not None or not (real | ~n.real).all():
             return n
-        at = tuple(
-            slice(k // STEP, k // STEP + size)
-            for k, size in zip((row, column), n.u.shape, strict=True)
-        )
-        u, v, real = projected(n.view, self.x[at], self.y[at], self.levels)
-        if not (real | ~n.real).all():
-            return n
+        rows = slice(part.row, part.row + part.height)
         return replace(
             n,
             levels=np.stack([u, v]),
-            rise=self.rise[:, row : row + h, column : column + w],
+            rise=self.rise[:, rows, part.column : part.column + part.width],
             seen=n.seen & inside(n.view.camera, u, v).all(0),
         )
 

@@ -33,6 +33,7 @@ from skyquilt.ortho.exposure import Exposure
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.labels import Labels
 from skyquilt.ortho.radiometry import Levelling
+from skyquilt.ortho.shown_parts import shown_parts
 from skyquilt.settings import USUAL_GB, MosaicSettings, PictureSettings
 from skyquilt.workflows.clip_frames import with_frames
 from skyquilt.workflows.finished import Earlier
@@ -288,8 +289,12 @@ def draw_map(
         "seams", _at_once(lambda: _labels(aligned, on, exposure, methods, clock))
     )
     make_room(aligned.found, aligned.grey, aligned.links)
+    parts = None
+    if labels is not None and aligned.pixels.crowded:
+        shown = shown_parts(labels, on.views, on.surface, orthomosaic.BLOCK)
+        parts = aligned.pixels.parts(shown)
     compose = orthomosaic.composer(
-        first.channels, first.dtype, on, exposure, labels, methods.blend, aligned.pixels
+        first.channels, first.dtype, on, exposure, labels, methods.blend, aligned.pixels, parts
     )
     drawing = orthomosaic.Drawing(
         output=output,
@@ -300,6 +305,7 @@ def draw_map(
         unit=first.unit,
         store=clock.store,
         key=orthomosaic.map_key(key, alignment, on, exposure, labels),
+        parts=parts,
         growth=on.growth,
     )
     drawn = yield from clock.stage("mosaic", _drawn(drawing, aligned.pixels, clock.workers))

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.engine.clock import Steps
-from skyquilt.engine.pixel_cache import PixelCache
+from skyquilt.engine.pixel_cache import Box, PhotoParts, PixelCache, Step
 from skyquilt.engine.store import Store, digest
 from skyquilt.engine.workers import Workers
 from skyquilt.errors import NoPhotosError, OutputError, PhotoFailedError, UnreadablePhotoError
@@ -32,6 +32,8 @@ the search of heights.
 """
 KEPT_BYTES = 150_000_000
 """Bytes of grey images, and of features, kept in memory; the others are read from the store."""
+MOST_LONGEST = 2**20
+"""More px than grey images are asked for: images of several sizes are kept together."""
 PhotoPixels = Callable[[int], NDArray[Any]]
 """Full-size pixels of a photo by its index."""
 FRAMES = "looks"
@@ -130,23 +132,35 @@ class PixelsInUse:
     ) -> None:
         """`number`: the number of each photo in the cache."""
         self._names, self._number = tuple(p.name for p in photos), tuple(number)
+        self._nbytes = sum(
+            p.width * p.height * p.channels * np.dtype(p.dtype).itemsize for p in photos
+        )
         self._cache = cache
 
-    def __call__(self, photo: int) -> NDArray[Any]:
-        """Pixels of a photo (index), read-only.
+    def __call__(self, photo: int, *, once: bool = False) -> NDArray[Any]:
+        """Pixels of a photo (index), read-only. `once`: it is not asked for again soon.
 
         Raises:
             PhotoFailedError: a photo that could be read before is lost.
             MemoryError: there is not enough memory.
         """
         try:
-            return self._cache(self._number[photo])
+            return (self._cache.once if once else self._cache)(self._number[photo])
         except Exception as error:  # whatever it is, it concerns this photo alone
             name = self._names[photo]
             if out_of_memory(error):
                 raise MemoryError(f"it does not suffice to decode {name}") from error
             reason = rejected(name, error).reason
             raise PhotoFailedError(name, f"it could be read before, but now {reason}") from error
+
+    @property
+    def crowded(self) -> bool:
+        """Whether not all photos fit into memory."""
+        return self._cache.dropped > 0 or self._nbytes > self._cache.budget_bytes
+
+    def parts(self, asked: Mapping[int, Mapping[Step, Box]]) -> PhotoParts:
+        """Keeps no more of photos than what steps ask for, by the photo's index."""
+        return PhotoParts(lambda photo: self(photo, once=True), asked, self._cache)
 
     def make_room(self) -> None:
         """Drops the photos kept in memory where not all fit."""
@@ -159,8 +173,10 @@ class GreyPictures:
     def __init__(self, photos: Sequence[Photo], pixels: PhotoPixels, store: Store) -> None:
         self._photos, self._pixels, self._store = photos, pixels, store
         self._cache = PixelCache(read=self._load, budget_bytes=KEPT_BYTES)
-        self._small = PixelCache(read=self._shrunken, budget_bytes=KEPT_BYTES // 3)
-        self._longest = 0
+        self._small = PixelCache(
+            read=lambda key: self._shrunken(*divmod(key, MOST_LONGEST)),
+            budget_bytes=KEPT_BYTES // 3,
+        )
 
     def __call__(self, photo: int, longest: int) -> NDArray[np.uint8]:
         """Grey image of a photo (index), with at most `longest` px on its longest side. Those of
@@ -168,18 +184,15 @@ class GreyPictures:
         """
         if longest == PICTURE:
             return self._cache(photo)
-        if longest != self._longest:
-            self._small.clear()
-            self._longest = longest
-        return self._small(photo)
+        return self._small(photo * MOST_LONGEST + longest)
 
     def make_room(self) -> None:
         """Drops the images kept in memory where not all fit."""
         self._cache.make_room()
         self._small.make_room()
 
-    def _shrunken(self, photo: int) -> NDArray[np.uint8]:
-        longest, own = self._longest, self._photos[photo]
+    def _shrunken(self, photo: int, longest: int) -> NDArray[np.uint8]:
+        own = self._photos[photo]
         if longest > PICTURE and max(own.width, own.height) > PICTURE:
             return self._store.get_or(
                 "pictures",
