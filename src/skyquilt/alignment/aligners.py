@@ -29,7 +29,11 @@ from skyquilt.model.poses import Alignment, Pose, Prior
 
 SHOWN_ALREADY = 0.8
 """Photos without links are left out where connected photos show more than this share of what they
-would show, and so are whole blocks where the largest one shows more of it.
+would show, and so are small blocks where the largest one shows more of it.
+"""
+STRANGE = 0.25
+"""Such blocks have fewer photos than this share of the largest one: two flights that do not look
+alike, or lines of a wide lens that overlap by far, are both worth their place.
 """
 NEIGHBOURS = 40
 """So many of the nearest connected photos are asked."""
@@ -204,22 +208,22 @@ def placed_by_metadata(
 
 
 def without_strange_blocks(found: Alignment) -> Alignment:
-    """The alignment without blocks that no link connects with the largest one though this shows the
-    same ground. They do not look like it: photos of people or of a room, another season, negatives.
-    They would be drawn over it, as far off as positions are.
+    """The alignment without small blocks that no link connects with the largest one though this
+    shows the same ground. They do not look like it: photos of people or of a room before the
+    flight, or a few of another day. They would be drawn over it, as far off as positions are.
     """
     first, *others = [b for b in found.blocks if len(b) > 1] or [()]
     reasons, notes = dict[int, str](), list[str]()
     for block in others:
         shown = [share_shown(found.poses[i], found.camera(i), found, first) for i in block]
-        if float(np.mean(shown)) > SHOWN_ALREADY:
+        if len(block) < STRANGE * len(first) and float(np.mean(shown)) > SHOWN_ALREADY:
             why = f"not with the {len(first)} of the largest block, which show the same ground"
             reason = f"it is linked with {len(block) - 1} other photos, but {why}"
             reasons |= dict.fromkeys(block, reason)
             notes.append(
                 f"{len(block)} photos are left out: they are linked with one another, but {why}."
-                " Either they show something else, or it looks different on them (another season,"
-                " other colours); if they belong to the survey, map them by themselves."
+                " They show something else, or it looks different on them (another day); if they"
+                " belong to the survey, map them by themselves."
             )
     if not reasons:
         return found

@@ -125,6 +125,10 @@ class Photo:
     """1 or 3 (or more, multi-band TIFF)."""
     dtype: Literal["uint8", "uint16", "float32"]
     """Type of the decoded pixels."""
+    alpha: bool = False
+    """Whether pixels may be see-through; these are black, or NaN where values are real numbers."""
+    saved_grey: bool = False
+    """Whether its file has one band, though it is read as colours, as others of its camera are."""
     band: Literal["visible", "thermal"]
     """Spectrum."""
     unit: Literal["", "celsius", "counts"] = ""

@@ -220,6 +220,8 @@ class Header:
     """XMP properties."""
     jpeg: JpegHeader | None = None
     """The segments, of a JPEG."""
+    alpha: bool = False
+    """Whether pixels may be see-through."""
 
 
 def read_header(path: Path, *, most_mp: float = MOST_MP) -> Header:

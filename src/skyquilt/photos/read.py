@@ -195,6 +195,7 @@ def _photo(path: Path, name: str, header: Header, thermal_unit: str | None) -> P
         height=height,
         channels=1 if frame else header.channels,
         dtype="float32" if frame else header.dtype,
+        alpha=header.alpha,
         band="thermal" if lens.thermal else "visible",
         unit=frame.unit if frame else "",
         stored=frame.stored if frame else "",

@@ -170,7 +170,8 @@ def read_survey(
     if cameras:
         photos, more = apply_cameras(photos, read_cameras_json(cameras), file=cameras)
         notes = (*notes, *more)
-    photos, implausible = placed_plausibly(_with_editors(photos))
+    photos, greyed = _in_colour(_with_editors(photos))
+    photos, implausible = placed_plausibly(photos)
     return Survey(
         photos=photos,
         rejected=tuple(sorted((*rejected, *copies, *reduced), key=lambda r: r.name)),
@@ -182,6 +183,7 @@ def read_survey(
             *notes,
             *_run_notes(found),
             *_unread_notes(found),
+            *greyed,
             *implausible,
             *survey_notes(photos, len(copies) + len(reduced)),
         ),
@@ -205,6 +207,23 @@ def _with_editors(photos: Sequence[Photo]) -> tuple[Photo, ...]:
     return tuple(
         replace(p, editor=UNNAMED) if changed and p.editor is None else p
         for p, changed in zip(photos, other, strict=True)
+    )
+
+
+def _in_colour(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
+    """The photos, those saved in grey of a camera whose others are in colour to be read as
+    colours, too, so that one map shows both; and a note on these.
+    """
+    plain = [p for p in photos if p.dtype == "uint8" and not (p.unit or p.band_name)]
+    coloured = {p.camera_key for p in plain if p.channels == 3}
+    grey = {p.name for p in plain if p.channels == 1 and p.camera_key in coloured}
+    if not grey:
+        return tuple(photos), ()
+    read = [replace(p, channels=3, saved_grey=True) if p.name in grey else p for p in photos]
+    return tuple(read), (
+        f"{len(grey)} photos are grey, though others of their camera are in colour:"
+        f" {sentence_of(sorted(grey))}. They are mapped together, and stay grey; for a map in"
+        " colours, leave them out.",
     )
 
 

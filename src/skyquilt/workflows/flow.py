@@ -262,6 +262,7 @@ def find_ground(
         clock.workers,
         pictures=picture_recipe(),
         earlier=earlier,
+        see_through=[i for i, p in enumerate(aligned.photos) if p.alpha],
     )
     return (yield from clock.stage("surface", steps))
 
@@ -330,6 +331,7 @@ def _exposure(
         drift=methods.drift,
         settings=picture,
         keep=store.parts("balance", key),
+        mixed=any(p.saved_grey for p in aligned.photos),
     )
     return store.get_or("balance", key, lambda: levelled(on))
 

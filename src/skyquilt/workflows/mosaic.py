@@ -389,7 +389,7 @@ def _metrics(
                 *enlargement_warnings(aligned.priors, alignment),
                 *tilt_warnings(aligned.priors, alignment),
             ],
-            notes=[*survey.notes, *alignment.notes],
+            notes=[*survey.notes, *alignment.notes, *ground.notes],
         )
         | {
             "heights": height_figures(
