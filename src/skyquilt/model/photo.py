@@ -17,7 +17,9 @@ Datum = Literal["takeoff", "sea_level", "egm96", "ellipsoid", "control", "unknow
 """
 
 
-Stored = Literal["", "celsius", "kelvin", "decikelvin", "centikelvin", "counts"]
+Stored = Literal[
+    "", "celsius", "kelvin", "decikelvin", "centikelvin", "decicelsius", "centicelsius", "counts"
+]
 """What a value of a thermal TIFF may mean: degrees Celsius, (tenths, hundredths of a) kelvin, or
 sensor counts.
 """

@@ -90,6 +90,7 @@ def read_tiff(file: BinaryIO, most_mp: float) -> Header:
             exif=exif,
             xmp=parse_xmp((packet,) if isinstance(packet, bytes) and packet else ()),
             alpha=alpha > 0,
+            stored=page.dtype.name,
         )
 
 

@@ -25,6 +25,7 @@ from skyquilt.photos.read import ReadPhoto, read_photo
 from skyquilt.photos.recoded import UNNAMED, recoded
 from skyquilt.photos.side_files import apply_positions
 from skyquilt.photos.side_rows import sentence_of
+from skyquilt.photos.thermal import UNSTATED
 from skyquilt.video.read import CLIP_ENDINGS, side_files
 
 _PHOTO_ENDINGS = frozenset({".jpg", ".jpeg", ".tif", ".tiff", ".png"})
@@ -331,19 +332,16 @@ def _thermal_units(photos: Sequence[Photo]) -> Iterator[str]:
             " --thermal-unit."
         )
     elif units:
-        yield f"Thermal TIFFs are read as {listed.split(' as ')[1]} ({sum(units.values())})."
+        guessed = next((f" {n}" for p in photos for n in p.notes if UNSTATED in n), "")
+        unit = listed.split(" as ")[1]
+        yield f"Thermal TIFFs are read as {unit} ({sum(units.values())}).{guessed}"
     untold = [
-        p
-        for p in photos
-        if p.dtype == "uint16"
-        and p.channels == 1
-        and not p.unit
-        and p.camera_key.startswith("unknown camera")
+        p for p in photos if p.dtype != "uint8" and p.channels == 1 and not (p.unit or p.band_name)
     ]
     if untold:
         yield (
-            f"{len(untold)} photos have one band of 16 bits and state neither unit nor maker: they"
-            " are mapped as brightness; if they are temperatures, give --thermal-unit."
+            f"{len(untold)} photos have one band of 16 bits or more and state no unit: they are"
+            " mapped as brightness; if they are temperatures, give --thermal-unit."
         )
 
 
