@@ -11,6 +11,7 @@ from skyquilt.alignment.control import Control, hold_to_control, residuals_of_co
 from skyquilt.alignment.determined import weak_photos
 from skyquilt.alignment.displaced_parts import brought_together
 from skyquilt.alignment.dominant_plane import levelled
+from skyquilt.alignment.enlarged import as_enlarged, enlarged_note, enlarged_photos, fits_better
 from skyquilt.alignment.equations import NearFactor
 from skyquilt.alignment.late_positions import moved_note, unshifted
 from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
@@ -42,6 +43,10 @@ from skyquilt.model.poses import Alignment, MapFrame, Prior, TiePoints
 
 ROUGHLY = 64
 """Observations per photo of the first stage, which only removes outliers and sets out."""
+ENLARGED_AGAIN = 3
+"""Photos that are enlarged by other factors are divided so often at most: what fits none of the
+cameras bends the heights by which the next are told.
+"""
 BEGUN_AGAIN = 5
 """An oblique survey without camera angles is adjusted again as it was found, so often at most, as
 long as photos come nearer to their positions.
@@ -74,7 +79,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 46
+    version: ClassVar[int] = 47
 
     def __call__(
         self,
@@ -119,6 +124,17 @@ class Bundle:
             aside, found = frozenset(), block(frozenset())
         said, name = list[str](), ""
         cameras = [p.camera_key for p in photos]
+        taken, factors = photos, dict[int, float]()
+        for again in range(ENLARGED_AGAIN) if self.repair else ():
+            large = enlarged_photos(found, [p.camera_key for p in photos], priors)
+            tried = factors | {i: factors.get(i, 1.0) * f for i, f in large.items()}
+            before, photos = photos, as_enlarged(taken, tried)
+            if not large or not fits_better(other := block(aside, priors, f"big {again} "), found):
+                photos = before
+                break
+            found, factors, name = other, tried, f"big {again} "
+        if factors:
+            said.append(enlarged_note(factors, cameras))
         moved = unshifted(found, priors, cameras) if self.repair else priors
         if moved is not priors:
             other = block(aside, moved, "moved ")
