@@ -31,7 +31,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Blank:
-    """Where a photo shows nothing."""
+    """Where a photo shows nothing, or a mark."""
 
     room: NDArray[np.float32]
     """(h, w) distance from there, in the pixels of this raster, as a share of `REACH`; negative
@@ -82,6 +82,14 @@ def find_blanks(
                 " its rim (black corners or bars, or see-through pixels): that is not drawn."
             )
     return found, tuple(notes)
+
+
+def marked(mask: Mask, cell_px: float) -> Blank:
+    """Where photos show marks, from cells (h, w) of so many px on which features were found."""
+    around = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    rows, columns = mask.shape
+    size = round(columns * cell_px), round(rows * cell_px)
+    return Blank(room=_room(around > 0), size=size)
 
 
 def blank_rim(pictures: Sequence[NDArray[np.uint8]]) -> Mask | None:

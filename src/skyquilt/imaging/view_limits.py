@@ -62,12 +62,18 @@ class ViewLimits:
     """Where heights are known; None = there are no tie points, and so no limit."""
     blanks: Mapping[int, Blank] = field(default_factory=dict)
     """Where photos show nothing, by their index; only of those that do not everywhere."""
+    marks: Mapping[int, Blank] = field(default_factory=dict)
+    """Where photos show marks (texts, logos), so that others are preferred, by their index."""
     blank: Blank | None = None
-    """The same of the one photo that these limits are of."""
+    """`blanks` of the one photo that these limits are of."""
+    mark: Blank | None = None
+    """`marks` of that photo."""
 
     def of(self, photo: int) -> "ViewLimits":
-        """The limits of a photo (index): these, and where it shows nothing."""
-        return replace(self, blank=self.blanks[photo]) if photo in self.blanks else self
+        """The limits of a photo (index): these, and where it shows nothing, or marks."""
+        if photo not in self.blanks and photo not in self.marks:
+            return self
+        return replace(self, blank=self.blanks.get(photo), mark=self.marks.get(photo))
 
     @property
     def tangent(self) -> float:

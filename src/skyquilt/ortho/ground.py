@@ -1,6 +1,6 @@
 """The ground of a map: heights, the view of each photo, and the map's grid."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -26,6 +26,8 @@ from skyquilt.settings import PictureSettings
 GreyPicture = Callable[[int, int], NDArray[np.uint8]]
 """Gives the grey image of a photo (index), with at most the given px on its longest side."""
 
+NONE: Mapping[int, Blank] = {}
+"""No photo has marks."""
 FINEST = 20
 """Largest number of map pixels per photo pixel, along a side."""
 MOST_PIXELS = 4e11
@@ -89,11 +91,13 @@ def find_ground(
     pictures: tuple[Any, ...] = (),
     earlier: EarlierMap | None = None,
     see_through: Collection[int] = (),
+    marks: Mapping[int, Blank] = NONE,
 ) -> Steps[Ground]:
     """Heights from tie points (level ground if there are none), refined by the sweep if one is
     given, and the grid of the map. `pictures` describes how the grey images are made; it is part of
     the key under which a swept surface is stored. Away from photos that changed, the heights of an
-    `earlier` map stay. `see_through`: photos (indices) with an alpha channel.
+    `earlier` map stay. `see_through`: photos (indices) with an alpha channel;
+    `marks`: where photos show marks.
 
     Raises:
         UsageError: the map would have no pixels, or far too many.
@@ -102,7 +106,8 @@ def find_ground(
     xyz = alignment.ties.xyz
     flat = level(float(np.median(xyz[:, 2])) if len(xyz) else 0.0)
     blanks, notes = _blanks(alignment, see_through, grey)
-    limits = replace(view_limits(alignment, flat, picture.max_view_angle), blanks=blanks)
+    limits = view_limits(alignment, flat, picture.max_view_angle)
+    limits = replace(limits, blanks=blanks, marks=marks)
     rough = make_views(alignment, flat, limits)
     if not rough:
         raise UsageError(

@@ -185,7 +185,7 @@ def drift_of_rigged(
 
 def _views(found: Rigged, ground: Ground) -> list[View]:
     """What the thermal frames see within the limits of the visual photos."""
-    return make_views(found.alignment, ground.surface, replace(ground.limits, blanks={}))
+    return make_views(found.alignment, ground.surface, replace(ground.limits, blanks={}, marks={}))
 
 
 def draw_rigged(
