@@ -84,6 +84,12 @@ def test_a_see_through_photo_tells_for_itself():
         assert not (inside & ~want).any() and (inside | near).all()
 
 
+def test_dark_shadows_of_a_photo_that_might_be_see_through_stay():
+    picture = np.full((HIGH, WIDE), 120, np.uint8)
+    picture[:60, :90] = 9
+    assert find_blanks({0: ("c", (WIDE, HIGH))}, {0}, lambda i, longest: picture) == ({}, ())
+
+
 def test_views_show_nothing_where_their_photo_does():
     """The projected circle, by the textbook; a footprint ends there too."""
     rim = Blank(

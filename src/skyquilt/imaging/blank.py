@@ -16,6 +16,8 @@ LONGEST = 256
 """Longest side in px of the pictures that are compared."""
 BLACK = 12
 """Level of 255 up to which a picture shows nothing, in every photo of the camera."""
+EMPTY = 4
+"""The same level of a see-through photo, whose empty pixels are 0 before contrast is stretched."""
 LEAST, MOST = 0.002, 0.7
 """Shares of a picture that may show nothing; less is noise, more is a picture of the night."""
 STEP, BESIDE = 25, 4
@@ -71,10 +73,12 @@ def find_blanks(
             shared = blank_rim([grey(alike[k], LONGEST) for k in some])
         masks = dict.fromkeys(alike, shared) if shared is not None else {}
         for i in own:
-            if i in see_through and (rim := _rim(grey(i, LONGEST) <= BLACK)).mean() > LEAST:
+            if i in see_through and (rim := _rim(grey(i, LONGEST) <= EMPTY)).mean() > LEAST:
                 masks[i] = rim
-        made = {id(m): Blank(room=_room(m), size=size) for m in masks.values()}
-        found |= {i: made[id(m)] for i, m in masks.items()}
+        made = dict[bytes, Blank]()  # programs that undistort photos leave all alike
+        for i, mask in masks.items():
+            key = mask.tobytes()
+            made[key] = found[i] = made.get(key) or Blank(room=_room(mask), size=size)
         if masks:
             share = 100 * float(np.median([m.mean() for m in masks.values()]))
             notes.append(

@@ -73,7 +73,8 @@ class ViewLimits:
         """The limits of a photo (index): these, and where it shows nothing, or marks."""
         if photo not in self.blanks and photo not in self.marks:
             return self
-        return replace(self, blank=self.blanks.get(photo), mark=self.marks.get(photo))
+        blank, mark = self.blanks.get(photo), self.marks.get(photo)
+        return replace(self, blanks={}, marks={}, blank=blank, mark=mark)
 
     @property
     def tangent(self) -> float:
