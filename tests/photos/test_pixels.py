@@ -209,6 +209,7 @@ def test_png_of_sixteen_bits_keeps_them(tmp_path):
     photo = read_photo(tmp_path / "d.png")
     assert (photo.channels, photo.dtype, photo.alpha) == (3, "uint16", False)
     assert np.array_equal(read_color(photo), values[..., ::-1])
+    assert any("1 photos in colour have 16 bits" in n for n in read_survey(tmp_path).notes)
 
 
 def test_truncated_tiff(tmp_path):

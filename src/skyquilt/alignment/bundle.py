@@ -127,9 +127,11 @@ class Bundle:
         taken, factors = photos, dict[int, float]()
         for again in range(ENLARGED_AGAIN) if self.repair else ():
             large = enlarged_photos(found, [p.camera_key for p in photos], priors)
+            if not large:
+                break
             tried = factors | {i: factors.get(i, 1.0) * f for i, f in large.items()}
             before, photos = photos, as_enlarged(taken, tried)
-            if not large or not fits_better(other := block(aside, priors, f"big {again} "), found):
+            if not fits_better(other := block(aside, priors, f"big {again} "), found):
                 photos = before
                 break
             found, factors, name = other, tried, f"big {again} "
