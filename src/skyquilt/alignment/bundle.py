@@ -13,6 +13,7 @@ from skyquilt.alignment.displaced_parts import brought_together
 from skyquilt.alignment.dominant_plane import levelled
 from skyquilt.alignment.enlarged import as_enlarged, enlarged_note, enlarged_photos, fits_better
 from skyquilt.alignment.equations import NearFactor
+from skyquilt.alignment.false_tilts import told_no_tilt
 from skyquilt.alignment.late_positions import moved_note, unshifted
 from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
 from skyquilt.alignment.oblique import found_oblique, hung, reported_oblique, tilts_reported
@@ -79,7 +80,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 47
+    version: ClassVar[int] = 48
 
     def __call__(
         self,
@@ -143,6 +144,12 @@ class Bundle:
             if off_positions(other, moved) < off_positions(found, priors):
                 said.append(moved_note(priors, moved))
                 found, priors, name = other, moved, "moved "
+        if level := self.repair and not slanting(priors):
+            loose, note = told_no_tilt(found, priors)
+            other = block(aside, loose, "loose ") if note else found
+            if note and off_positions(other, loose) < off_positions(found, priors):
+                said.append(note)
+                found, priors, name = other, loose, "loose "
         linked = len({i for k in links for i in (k.a, k.b)})
         guessed = False
         if self.repair and misled(found, priors, linked):
@@ -158,7 +165,7 @@ class Bundle:
             if not nearer(other, found, priors):
                 break
             found, aside, guessed = other, untold(turned), True
-        level = self.repair and not guessed and not slanting(priors)
+        level &= not guessed
         together = brought_together(found, [p.name for p in photos], priors) if level else None
         if together is not None:
             other = block(aside, together.priors, "together ")
