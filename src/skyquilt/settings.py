@@ -21,7 +21,16 @@ TRANSFORMS = ("translation", "similarity", "affine", "homography")
 BLENDS = ("feather", "first", "average", "multiband")
 COMPRESSIONS = ("auto", "jpeg", "deflate", "zstd", "lzw", "none")
 SURFACES = ("auto", "dense", "sweep", "ties")
-THERMAL_UNITS = ("auto", "celsius", "kelvin", "decikelvin", "centikelvin", "counts")
+THERMAL_UNITS = (
+    "auto",
+    "celsius",
+    "kelvin",
+    "decikelvin",
+    "centikelvin",
+    "decicelsius",
+    "centicelsius",
+    "counts",
+)
 VERTICAL_DATUMS = ("ellipsoid", "egm96", "takeoff")
 DISTORTIONS = ("none", "2", "4", "6", "6t", "full")
 SHUTTERS = ("global", "rolling")

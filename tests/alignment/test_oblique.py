@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skyquilt.alignment.aligners import shown_already, with_loose_photos
+from skyquilt.alignment.aligners import shown_already, with_loose_photos, without_strange_blocks
 from skyquilt.alignment.determined import deviation_px, weak_photos
 from skyquilt.alignment.dominant_plane import dominant_normal, levelled
 from skyquilt.alignment.inputs import AlignmentInputs
@@ -176,6 +176,24 @@ def test_a_photo_without_links_is_not_drawn_over_what_others_show():
     assert shown_already(pose(70, 0, z=-1.0), CAMERA, done)  # taken on the ground
     assert not shown_already(pose(75, 0), CAMERA, done)
     assert not shown_already(pose(0, 0, z=200.0), CAMERA, done)
+
+
+@pytest.mark.parametrize(("away_m", "left_out"), [(0.0, True), (15.0, True), (70.0, False)])
+def test_photos_that_only_match_one_another_are_not_drawn_over_what_the_others_show(
+    away_m, left_out
+):
+    """Two pictures of a room, taken before the flight, are linked with each other; so are photos
+    of a second field, which are part of the map.
+    """
+    two = [pose(away_m, 0), pose(away_m + 10, 0)]
+    done = block([*LAWN, *two], hills(3000))
+    own = tuple(range(len(LAWN)))
+    done = replace(done, blocks=(own, (15, 16)))
+    found = without_strange_blocks(done)
+    assert found.poses.keys() == {*own, *(() if left_out else (15, 16))}
+    assert found.rejected.keys() == ({15, 16} if left_out else set())
+    assert any("2 photos are left out" in note for note in found.notes) == left_out
+    assert set(found.ties.photo) == found.poses.keys()
 
 
 @pytest.mark.parametrize(("level", "placed"), [(0, False), (255, False), (11, False), (90, True)])

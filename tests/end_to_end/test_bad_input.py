@@ -6,9 +6,11 @@ import os
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import piexif
 import pytest
+import rasterio
 import tifffile
 from PIL import Image
 
@@ -211,17 +213,28 @@ def test_two_cameras_are_both_used(mosaic, photos, flight):
 
 @pytest.mark.slow
 def test_colour_and_single_band_mixed(mosaic, photos):
-    """A map has one kind of pixel: the frequent one; the others are named."""
-    grey = named(photos)[:2]
-    for path in grey:
+    """A map has one kind of pixel: the frequent one; those of other cameras are named. Of the same
+    camera, files that a program saved in grey stay in the map, and are not tinted.
+    """
+    *grey, saved = named(photos)[:3]
+    for path in (*grey, saved):
         block, xmp, _ = taken_apart(path.read_bytes())
+        if path is not saved:
+            block = block.replace(b"Simulated", b"Different")
         data = jpeg_bytes(np.asarray(Image.fromarray(pixels_of(path)).convert("L")))
         data = with_segment(data, 0xE1, b"http://ns.adobe.com/xap/1.0/\x00" + xmp.encode())
         path.write_bytes(with_segment(data, 0xE1, block))
     told = mosaic(photos).made()
     assert set(told.metrics["photos_rejected"]) == {p.name for p in grey}
     assert all("differ from the survey's" in r for r in told.metrics["photos_rejected"].values())
-    assert told.metrics["photos_used"] == 7
+    assert told.metrics["photos_used"] == 7 and f"are in colour: {saved.name}" in told.notes
+    with rasterio.open(told.output / "mosaic.tif") as map_:
+        shown = map_.read()
+    with rasterio.open(told.output / "provenance.tif") as raster:
+        place = cv2.resize(raster.read(1), shown.shape[:0:-1], interpolation=cv2.INTER_NEAREST)
+    inner = cv2.erode((place == 1).astype(np.uint8), np.ones((25, 25))) > 0  # the first in order
+    spread = np.ptp(shown[:, inner].astype(int), axis=0)
+    assert inner.sum() > 50 and np.percentile(spread, 95) <= 3
 
 
 @pytest.mark.slow

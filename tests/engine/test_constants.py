@@ -53,8 +53,8 @@ IN_NO_KEY = {
     ),
     **dict.fromkeys(
         ("_WIDTH", "_HEIGHT", "_BITS", "_CODEC", "_SAMPLES", "_STRIPS", "_TILES", "_XMP_TAG")
-        + ("_CODECS",),
-        "the numbers that the TIFF format gives to tags",
+        + ("_CODECS", "_STRANGE_COLOURS", "_YCBCR", "_JPEGS", "_PNG_BITS"),
+        "the numbers that the formats TIFF and PNG give to tags",
     ),
     **dict.fromkeys(
         ("MOST_CHUNKS", "MOST_STRIPS", "_LEAST_FOCAL", "_MOST"),

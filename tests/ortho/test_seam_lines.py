@@ -1,11 +1,15 @@
 """Seams go around objects and through places where photos agree; hidden places are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from skyquilt.engine.kept import Keep
 from skyquilt.engine.workers import Threads
-from skyquilt.imaging.nodes import densify
+from skyquilt.imaging.blank import marked
+from skyquilt.imaging.nodes import densify, project_nodes
+from skyquilt.imaging.view_limits import ViewLimits
 from skyquilt.model.raster import Grid, Window
 from skyquilt.ortho.bare_ground import bare_ground
 from skyquilt.ortho.contours import contour_lines
@@ -65,6 +69,30 @@ def test_alike_photos_are_parted_in_the_middle(scene):
         mine = np.where(labels.photo == photo, away[k], mine)
     lost = (mine - away.min(0))[shown]
     assert (lost < 0.5).mean() > 0.6 and np.percentile(lost, 90) < 8.0
+
+
+def test_marks_are_shown_only_where_no_other_photo_shows_the_ground(scene):
+    """A cross in the middle of every photo, 60 px long; of a single photo it stays on the map."""
+    views, pictures = scene
+    shown = np.zeros((30, 40), bool)
+    shown[12:18, 20] = shown[15, 17:24] = True  # cells of 10 px
+    mark = marked(shown, 10.0)
+    withs = [replace(v, limits=ViewLimits(mark=mark)) for v in views]
+
+    def share(some):
+        labels = SeamLines()(some, FLAT, GRID, lambda photo, side: pictures[photo], NEUTRAL)
+        cells, found = labels.cells, []
+        x, y = np.meshgrid(cells.x(np.arange(cells.width)), cells.y(np.arange(cells.height)))
+        for v in views:
+            nodes = project_nodes(v, x, y, np.zeros_like(x))
+            u, w = (np.clip(p, 0, 399).astype(int) // 10 for p in (nodes.u, nodes.v))
+            on = nodes.seen & shown[np.clip(w, 0, 29), u]
+            found.append((labels.photo == v.photo)[on].mean())
+        return found
+
+    before, after, one = share(views), share(withs), share(withs[:1])
+    assert max(before) > 0.9 and one[0] == 1
+    assert max(after) <= 0.02
 
 
 def test_tiles_continue_their_neighbours(scene, monkeypatch):

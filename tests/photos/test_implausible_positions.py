@@ -43,6 +43,32 @@ def test_the_larger_of_two_sites_is_mapped_and_the_other_is_named_once(make_jpeg
     assert note.startswith(f"{min(first, second)} photos")
 
 
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ((-1, 1), "north and south"),
+        ((1, -1), "east and west"),
+        ((-1, -1), "north and south, east and west"),
+        (None, "latitude and longitude"),
+    ],
+)
+@pytest.mark.parametrize("drone", [False, True])
+def test_signs_that_some_positions_lost_are_given_back(make_jpeg, kind, words, drone):
+    """A program that rewrites photos loses the letters S and W of some."""
+    true = [(-33.9 + i * 0.000123, -70.6 + i * 0.00007) for i in range(9)]
+    for i, (north, east) in enumerate(true):
+        place = (north, east) if i < 6 else (east, north)
+        if kind and i >= 6:
+            place = north * kind[0], east * kind[1]
+        folder = photo_at(make_jpeg, i, *place, drone)
+    survey = read_survey(folder)
+    for photo, place in zip(survey.photos, true, strict=True):
+        found = photo.position.latitude_deg, photo.position.longitude_deg
+        assert found == pytest.approx(place, abs=1e-6)
+    (note,) = [n for n in survey.notes if "exchanged" in n]
+    assert note.startswith("3 photos (006.jpg") and f"once {words} are exchanged" in note
+
+
 def test_an_old_position_that_is_repeated_is_no_site(make_jpeg):
     for i in range(9):
         folder = photo_at(make_jpeg, i, 47.9 if i < 3 else 46.6 + i * 0.000123, 14.3)

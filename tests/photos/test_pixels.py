@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from skyquilt.errors import UnreadablePhotoError
 from skyquilt.model.photo import RejectedPhoto
 from skyquilt.photos.pixels import decode_jpeg, read_color, read_gray, reduce_pixels, to_gray
 from skyquilt.photos.read import read_photo
+from skyquilt.photos.survey import read_survey
 
 from .conftest import dji_exif, jpeg_bytes, pixels
 
@@ -132,6 +135,81 @@ def test_black_and_white_tiff_is_read_as_the_same_png_is(tmp_path, compression, 
     assert set(np.unique(read_color(photo))) == {0, 255}
     assert np.array_equal(read_color(photo), read_color(other))
     assert np.array_equal(read_gray(photo, reduction=2), read_gray(other, reduction=2))
+
+
+@pytest.mark.parametrize("mode", ["P", "CMYK", "RGBA", "LA"])
+def test_tiff_of_palettes_inks_and_alpha_is_read_as_pillow_reads_it(tmp_path, mode):
+    """Numbers of a palette's colours had been taken for brightness, inks for four bands."""
+    picture = Image.fromarray(pixels()).convert(mode)
+    picture.save(tmp_path / "p.tif")
+    photo = read_photo(tmp_path / "p.tif")
+    want = np.asarray(Image.open(tmp_path / "p.tif").convert("L" if mode == "LA" else "RGB"))
+    bands = 1 if want.ndim == 2 else 3
+    assert (photo.channels, photo.dtype, photo.alpha) == (bands, "uint8", mode[-1] == "A")
+    assert np.abs(read_color(photo).astype(int) - want).max() <= 1
+
+
+def test_grey_tiff_in_which_zero_is_white(tmp_path):
+    grey = pixels()[..., 0]
+    tifffile.imwrite(tmp_path / "w.tif", 255 - grey, photometric="miniswhite")
+    assert np.array_equal(read_color(read_photo(tmp_path / "w.tif")), grey)
+
+
+def test_tiff_in_colours_that_are_not_read_is_left_out_with_a_reason(tmp_path):
+    tifffile.imwrite(tmp_path / "l.tif", pixels(), photometric="cielab")
+    assert "save it as RGB" in read_photo(tmp_path / "l.tif").reason
+
+
+@pytest.mark.parametrize("kind", ["png", "tif"])
+@pytest.mark.parametrize(("bands", "dtype"), [(3, np.uint8), (3, np.uint16), (1, np.uint8)])
+def test_pixels_that_may_be_seen_through_hold_nothing(tmp_path, kind, bands, dtype):
+    """Whatever a program left in them was drawn as ground."""
+    rng = np.random.default_rng(4)
+    most = np.iinfo(dtype).max
+    values = rng.integers(1, most, (40, 60, bands)).astype(dtype)
+    alpha = np.where(np.arange(60) < 13, 0, most).astype(dtype) * np.ones((40, 1), dtype)
+    stored = np.concatenate([values, alpha[..., None]], 2)
+    path = tmp_path / f"a.{kind}"
+    if kind == "tif":
+        tifffile.imwrite(
+            path,
+            stored,
+            photometric="rgb" if bands == 3 else "minisblack",
+            extrasamples=["unassalpha"],
+            planarconfig="contig",
+        )
+    elif bands == 3:
+        cv2.imwrite(str(path), stored[..., [2, 1, 0, 3]])
+    else:
+        Image.fromarray(stored, "LA").save(path)
+    photo = read_photo(path)
+    assert (photo.channels, photo.dtype, photo.alpha) == (bands, np.dtype(dtype).name, True)
+    found = read_color(photo).reshape(40, 60, bands)
+    assert not found[:, :13].any()
+    assert np.array_equal(found[:, 13:], values[:, 13:])
+
+
+@pytest.mark.parametrize("name", ["g.jpg", "g.png", "g.tif"])
+def test_grey_among_colours_is_read_as_colours(tmp_path, name):
+    Image.fromarray(pixels()).save(tmp_path / f"c{name[1:]}")
+    Image.fromarray(pixels()[..., 0]).save(tmp_path / name)
+    survey = read_survey(tmp_path)
+    grey = next(p for p in survey.photos if p.name == name)
+    assert [p.channels for p in survey.photos] == [3, 3]
+    assert any("1 photos are grey" in note and name in note for note in survey.notes)
+    values = read_color(grey)
+    assert values.shape == (64, 96, 3) and (values == values[..., :1]).all()
+    assert np.array_equal(values[..., 0], read_color(replace(grey, channels=1)))
+
+
+def test_png_of_sixteen_bits_keeps_them(tmp_path):
+    """Of 12 bits in 16, eight upper ones are 16 levels of grey."""
+    values = (pixels().astype(np.uint16) * 16)[..., ::-1]
+    cv2.imwrite(str(tmp_path / "d.png"), values)
+    photo = read_photo(tmp_path / "d.png")
+    assert (photo.channels, photo.dtype, photo.alpha) == (3, "uint16", False)
+    assert np.array_equal(read_color(photo), values[..., ::-1])
+    assert any("1 photos in colour have 16 bits" in n for n in read_survey(tmp_path).notes)
 
 
 def test_truncated_tiff(tmp_path):

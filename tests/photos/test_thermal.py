@@ -263,6 +263,60 @@ def test_a_note_says_what_to_give_if_sixteen_bits_are_temperatures(tmp_path):
     assert not any("16 bits" in n for n in read_survey(tmp_path / "rgb").notes)
 
 
+@pytest.mark.parametrize(
+    ("kind", "unit", "per", "zero"),
+    [
+        (np.int16, "decicelsius", 10, 0.0),
+        (np.int16, "centicelsius", 100, 0.0),
+        (np.int16, "decikelvin", 10, 273.15),
+        (np.uint16, "decikelvin", 10, 273.15),
+        (np.uint16, "centikelvin", 100, 273.15),
+        (np.int32, "centikelvin", 100, 273.15),
+    ],
+)
+def test_integers_with_a_sign_may_be_parts_of_a_degree(tmp_path, kind, unit, per, zero):
+    """Programs write tenths of a degree Celsius into 16 bits with a sign; these were taken for
+    kelvin, 38 degrees below zero, or mapped as brightness without a word.
+    """
+    degrees = np.random.default_rng(5).uniform(11, 21, (60, 80))
+    values = np.round((degrees + zero) * per).astype(kind)
+    tifffile.imwrite(tmp_path / "t.tif", values)
+    assert read_photo(tmp_path / "t.tif").unit == ""
+    assert any("give --thermal-unit" in n for n in read_survey(tmp_path).notes)
+    for said in ("auto", unit):
+        photo = read_photo(tmp_path / "t.tif", thermal_unit=said)
+        assert (photo.unit, photo.stored) == ("celsius", unit)
+        np.testing.assert_allclose(read_color(photo), degrees, atol=0.06)
+
+
+def test_a_unit_that_was_derived_is_told_with_what_it_makes_of_the_values(tmp_path):
+    """23.5 degrees in hundredths, of which only the user knows that they are not kelvin."""
+    tifffile.imwrite(tmp_path / "t.tif", np.full((60, 80), 2350, np.uint16))
+    told = " ".join(read_survey(tmp_path, thermal_unit="auto").notes)
+    assert "decikelvin, -38.1 degrees Celsius; no unit is stated (set it with" in told
+    stated = " ".join(read_survey(tmp_path, thermal_unit="decikelvin").notes)
+    assert "degrees" not in stated and "Thermal TIFFs are read as decikelvin (1)." in stated
+
+
+@pytest.mark.parametrize("name", ["", "Red"])
+def test_shares_of_light_are_no_temperatures(tmp_path, name):
+    """A reflectance of 0.05 to 0.4, an index, or a band of a multispectral camera."""
+    values = np.random.default_rng(6).uniform(0.05, 0.4, (60, 80)).astype(np.float32)
+    if name:
+        values *= 50
+    xmp = (
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/">'
+        '<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description'
+        f' xmlns:Camera="http://pix4d.com/camera/1.0" Camera:BandName="{name}"/></rdf:RDF>'
+        "</x:xmpmeta>"
+    )
+    more = [(700, "B", len(xmp), xmp.encode(), True)] if name else []
+    tifffile.imwrite(tmp_path / "t.tif", values, extratags=more)
+    photo = read_photo(tmp_path / "t.tif")
+    assert (photo.band, photo.unit, photo.band_name) == ("visible", "", name.lower())
+    assert any("give --thermal-unit" in n for n in read_survey(tmp_path).notes) == (not name)
+
+
 def test_frames_of_one_survey_are_read_alike(tmp_path):
     """A hot frame's median lies where no temperature of tenths of a kelvin is; what was decided is
     what is read.

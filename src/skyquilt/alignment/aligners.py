@@ -15,7 +15,7 @@ from skyquilt.alignment.copied_views import without_copied_views
 from skyquilt.alignment.crowded_positions import without_crowded
 from skyquilt.alignment.determined import ground_places
 from skyquilt.alignment.inputs import AlignmentInputs
-from skyquilt.alignment.oblique import tilted
+from skyquilt.alignment.oblique import tilted, without_photos
 from skyquilt.alignment.pose import ByMetadata, ByPose
 from skyquilt.alignment.repair import Repaired, repair
 from skyquilt.alignment.start import ground_of
@@ -29,7 +29,11 @@ from skyquilt.model.poses import Alignment, Pose, Prior
 
 SHOWN_ALREADY = 0.8
 """Photos without links are left out where connected photos show more than this share of what they
-would show.
+would show, and so are small blocks where the largest one shows more of it.
+"""
+STRANGE = 0.25
+"""Such blocks have fewer photos than this share of the largest one: two flights that do not look
+alike, or lines of a wide lens that overlap by far, are both worth their place.
 """
 NEIGHBOURS = 40
 """So many of the nearest connected photos are asked."""
@@ -53,7 +57,7 @@ class ByLinks:
 
     bundle: Bundle = field(default_factory=Bundle)
     """The adjustment."""
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 5
     needs_links: ClassVar[bool] = True
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -64,7 +68,7 @@ class ByLinks:
         """
         inputs, said = without_crowded(inputs)
         if inputs.former is not None and (grown := added(inputs, self.bundle)) is not None:
-            return with_loose_photos(grown, inputs)
+            return without_strange_blocks(with_loose_photos(grown, inputs))
         control = control_in_frame(inputs.control, inputs.photos, inputs.frame)
         found = self.bundle(
             inputs.photos,
@@ -85,7 +89,7 @@ class ByLinks:
         }
         found = without_copied_views(found, [p.name for p in inputs.photos], told, bare)
         found = replace(found, notes=(*found.notes, *said))
-        return replace(with_loose_photos(found, inputs), why=REQUESTED)
+        return replace(without_strange_blocks(with_loose_photos(found, inputs)), why=REQUESTED)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,7 +127,7 @@ class Auto:
     """For linked photos."""
     pose: ByReport
     """For photos that only have positions."""
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 5
     needs_links: ClassVar[bool] = True
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -203,6 +207,29 @@ def placed_by_metadata(
     return replace(placed, notes=(*placed.notes, *repaired.notes))
 
 
+def without_strange_blocks(found: Alignment) -> Alignment:
+    """The alignment without small blocks that no link connects with the largest one though this
+    shows the same ground. They do not look like it: photos of people or of a room before the
+    flight, or a few of another day. They would be drawn over it, as far off as positions are.
+    """
+    first, *others = [b for b in found.blocks if len(b) > 1] or [()]
+    reasons, notes = dict[int, str](), list[str]()
+    for block in others:
+        shown = [share_shown(found.poses[i], found.camera(i), found, first) for i in block]
+        if len(block) < STRANGE * len(first) and float(np.mean(shown)) > SHOWN_ALREADY:
+            why = f"not with the {len(first)} of the largest block, which show the same ground"
+            reason = f"it is linked with {len(block) - 1} other photos, but {why}"
+            reasons |= dict.fromkeys(block, reason)
+            notes.append(
+                f"{len(block)} photos are left out: they are linked with one another, but {why}."
+                " They show something else, or it looks different on them (another day); if they"
+                " belong to the survey, map them by themselves."
+            )
+    if not reasons:
+        return found
+    return replace(without_photos(found, reasons), notes=(*found.notes, *notes))
+
+
 def with_loose_photos(alignment: Alignment, inputs: AlignmentInputs) -> Alignment:
     """Adds photos without links, placed by their own metadata relative to the adjusted ones, with a
     note each; photos that lack metadata, or are black or white, are rejected.
@@ -265,15 +292,22 @@ def shown_already(pose: Pose, camera: Camera, alignment: Alignment) -> bool:
     """Whether connected photos show what a photo without links would show. It does not look like
     them, then: a lens cap, a hand, a landing, a panorama; or it adds nothing to them.
     """
+    return share_shown(pose, camera, alignment, alignment.held) > SHOWN_ALREADY
+
+
+def share_shown(pose: Pose, camera: Camera, alignment: Alignment, by: Sequence[int]) -> float:
+    """The share of what a photo shows of the ground that photos `by` (indices) show, too; 1 for
+    photos taken below the ground, 0 where nothing is known.
+    """
     if not len(alignment.ties.xyz):
-        return False
+        return 0.0
     ground = float(np.median(alignment.ties.xyz[:, 2]))
     if pose.map_C[2] <= ground:
-        return True
+        return 1.0
     places = ground_places(pose, camera, ground)
     if not len(places):
-        return False
-    held = np.array(alignment.held)
+        return 0.0
+    held = np.array(by)
     away = [float(np.hypot(*(alignment.poses[i].map_C - pose.map_C)[:2])) for i in held.tolist()]
     shown = np.zeros(len(places), np.bool_)
     for i in held[np.argsort(away)[:NEIGHBOURS]].tolist():
@@ -281,7 +315,7 @@ def shown_already(pose: Pose, camera: Camera, alignment: Alignment) -> bool:
         ahead = local[:, 2] > 0
         px = project(own, np.where(ahead[:, None], local, [0.0, 0.0, 1.0]))
         shown |= ahead & ((px > 0) & (px < [own.width - 1, own.height - 1])).all(1)
-    return bool(shown.mean() > SHOWN_ALREADY)
+    return float(shown.mean())
 
 
 def _lacking(C: NDArray[np.float64], prior: Prior) -> str:

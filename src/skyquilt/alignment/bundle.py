@@ -11,7 +11,9 @@ from skyquilt.alignment.control import Control, hold_to_control, residuals_of_co
 from skyquilt.alignment.determined import weak_photos
 from skyquilt.alignment.displaced_parts import brought_together
 from skyquilt.alignment.dominant_plane import levelled
+from skyquilt.alignment.enlarged import as_enlarged, enlarged_note, enlarged_photos, fits_better
 from skyquilt.alignment.equations import NearFactor
+from skyquilt.alignment.false_tilts import told_no_tilt
 from skyquilt.alignment.late_positions import moved_note, unshifted
 from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
 from skyquilt.alignment.oblique import found_oblique, hung, reported_oblique, tilts_reported
@@ -42,6 +44,10 @@ from skyquilt.model.poses import Alignment, MapFrame, Prior, TiePoints
 
 ROUGHLY = 64
 """Observations per photo of the first stage, which only removes outliers and sets out."""
+ENLARGED_AGAIN = 3
+"""Photos that are enlarged by other factors are divided so often at most: what fits none of the
+cameras bends the heights by which the next are told.
+"""
 BEGUN_AGAIN = 5
 """An oblique survey without camera angles is adjusted again as it was found, so often at most, as
 long as photos come nearer to their positions.
@@ -74,7 +80,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 46
+    version: ClassVar[int] = 48
 
     def __call__(
         self,
@@ -119,12 +125,31 @@ class Bundle:
             aside, found = frozenset(), block(frozenset())
         said, name = list[str](), ""
         cameras = [p.camera_key for p in photos]
+        taken, factors = photos, dict[int, float]()
+        for again in range(ENLARGED_AGAIN) if self.repair else ():
+            large = enlarged_photos(found, [p.camera_key for p in photos], priors)
+            if not large:
+                break
+            tried = factors | {i: factors.get(i, 1.0) * f for i, f in large.items()}
+            before, photos = photos, as_enlarged(taken, tried)
+            if not fits_better(other := block(aside, priors, f"big {again} "), found):
+                photos = before
+                break
+            found, factors, name = other, tried, f"big {again} "
+        if factors:
+            said.append(enlarged_note(factors, cameras))
         moved = unshifted(found, priors, cameras) if self.repair else priors
         if moved is not priors:
             other = block(aside, moved, "moved ")
             if off_positions(other, moved) < off_positions(found, priors):
                 said.append(moved_note(priors, moved))
                 found, priors, name = other, moved, "moved "
+        if level := self.repair and not slanting(priors):
+            loose, note = told_no_tilt(found, priors)
+            other = block(aside, loose, "loose ") if note else found
+            if note and off_positions(other, loose) < off_positions(found, priors):
+                said.append(note)
+                found, priors, name = other, loose, "loose "
         linked = len({i for k in links for i in (k.a, k.b)})
         guessed = False
         if self.repair and misled(found, priors, linked):
@@ -140,7 +165,7 @@ class Bundle:
             if not nearer(other, found, priors):
                 break
             found, aside, guessed = other, untold(turned), True
-        level = self.repair and not guessed and not slanting(priors)
+        level &= not guessed
         together = brought_together(found, [p.name for p in photos], priors) if level else None
         if together is not None:
             other = block(aside, together.priors, "together ")

@@ -146,6 +146,8 @@ def project_nodes(view: View, x: NDArray[Any], y: NDArray[Any], z: NDArray[Any])
     drop = z - C[2]
     score = _scores(x - C[0], y - C[1], drop)
     room = view.limits.room(score, drop, x, y)
+    if view.limits.blank is not None:
+        room = np.minimum(room, view.limits.blank.at(u, v))
     return Nodes(
         view=view,
         u=u,
@@ -196,6 +198,8 @@ def project_all(
     for limits in {id(v.limits): v.limits for v in views}.values():
         mine = [n for n, v in enumerate(views) if v.limits is limits]
         room[mine] = limits.room(score[mine], dz[mine], x, y)
+        if limits.blank is not None:
+            room[mine] = np.minimum(room[mine], limits.blank.at(u[mine], v[mine]))
     seen &= room >= 0
     above = np.median(-dz.reshape(len(views), -1), axis=1).tolist()
     return [

@@ -4,13 +4,15 @@ A slanting ray turns an error of the height into a displacement of the picture, 
 large, and a pixel into a smear 1 / cos^2(angle) times as long.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.imaging.blank import Blank
 from skyquilt.model.surface import Surface
 
 Array = NDArray[np.float64]
@@ -58,6 +60,21 @@ class ViewLimits:
     """Ground size of a photo's pixel in m beyond which other photos are preferred."""
     support: Support | None = None
     """Where heights are known; None = there are no tie points, and so no limit."""
+    blanks: Mapping[int, Blank] = field(default_factory=dict)
+    """Where photos show nothing, by their index; only of those that do not everywhere."""
+    marks: Mapping[int, Blank] = field(default_factory=dict)
+    """Where photos show marks (texts, logos), so that others are preferred, by their index."""
+    blank: Blank | None = None
+    """`blanks` of the one photo that these limits are of."""
+    mark: Blank | None = None
+    """`marks` of that photo."""
+
+    def of(self, photo: int) -> "ViewLimits":
+        """The limits of a photo (index): these, and where it shows nothing, or marks."""
+        if photo not in self.blanks and photo not in self.marks:
+            return self
+        blank, mark = self.blanks.get(photo), self.marks.get(photo)
+        return replace(self, blanks={}, marks={}, blank=blank, mark=mark)
 
     @property
     def tangent(self) -> float:

@@ -61,8 +61,11 @@ def make_views(alignment: Alignment, surface: Surface, limits: ViewLimits = USUA
     for photo, pose in sorted(alignment.poses.items()):
         camera = alignment.camera(photo)
         outline = footprint(camera, pose, surface, limits=limits)
-        view = View(photo=photo, camera=camera, pose=pose, footprint=outline, limits=limits)
-        if len(outline) and limits.cuts(pose.map_C, outline, surface.at(*outline.T)):
+        own = limits.of(photo)
+        view = View(photo=photo, camera=camera, pose=pose, footprint=outline, limits=own)
+        if len(outline) and (
+            own.blank is not None or limits.cuts(pose.map_C, outline, surface.at(*outline.T))
+        ):
             view = replace(view, footprint=_shown_outline(view, surface))
         if len(view.footprint):
             views.append(view)

@@ -40,7 +40,8 @@ class FixedMarks:
         return tuple(
             f"Photos of {camera} show the same marks at the same place in every picture, on"
             f" {100 * mask.mean():.1f} % of it: a text or logo written into them, a frame, or dirt"
-            " on the lens. They are not used to connect photos, but they are on the map."
+            " on the lens. They are not used to connect photos, and are drawn only where no other"
+            " photo shows the ground (on the live map everywhere)."
             for camera, mask in self.masks.items()
         )
 

@@ -17,7 +17,9 @@ Datum = Literal["takeoff", "sea_level", "egm96", "ellipsoid", "control", "unknow
 """
 
 
-Stored = Literal["", "celsius", "kelvin", "decikelvin", "centikelvin", "counts"]
+Stored = Literal[
+    "", "celsius", "kelvin", "decikelvin", "centikelvin", "decicelsius", "centicelsius", "counts"
+]
 """What a value of a thermal TIFF may mean: degrees Celsius, (tenths, hundredths of a) kelvin, or
 sensor counts.
 """
@@ -125,6 +127,10 @@ class Photo:
     """1 or 3 (or more, multi-band TIFF)."""
     dtype: Literal["uint8", "uint16", "float32"]
     """Type of the decoded pixels."""
+    alpha: bool = False
+    """Whether pixels may be see-through; these are black, or NaN where values are real numbers."""
+    saved_grey: bool = False
+    """Whether its file has one band, though it is read as colours, as others of its camera are."""
     band: Literal["visible", "thermal"]
     """Spectrum."""
     unit: Literal["", "celsius", "counts"] = ""

@@ -1,7 +1,7 @@
 """The ground of a map: heights, the view of each photo, and the map's grid."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -12,6 +12,7 @@ from skyquilt.engine.kept import Keep
 from skyquilt.engine.store import Store, digest
 from skyquilt.engine.workers import HERE, Workers
 from skyquilt.errors import SideFileError, UsageError
+from skyquilt.imaging.blank import Blank, find_blanks
 from skyquilt.imaging.nodes import View
 from skyquilt.imaging.view_limits import USUAL, ViewLimits, limits_for
 from skyquilt.imaging.views import grid_of, make_views, native_gsd
@@ -25,6 +26,8 @@ from skyquilt.settings import PictureSettings
 GreyPicture = Callable[[int, int], NDArray[np.uint8]]
 """Gives the grey image of a photo (index), with at most the given px on its longest side."""
 
+NONE: Mapping[int, Blank] = {}
+"""No photo has marks."""
 FINEST = 20
 """Largest number of map pixels per photo pixel, along a side."""
 MOST_PIXELS = 4e11
@@ -72,6 +75,8 @@ class Ground:
     """The earlier map that it continues; None = all is made anew."""
     key: str = ""
     """Key of the surface in the store."""
+    notes: tuple[str, ...] = ()
+    """Messages for the user."""
 
 
 def find_ground(
@@ -85,11 +90,14 @@ def find_ground(
     *,
     pictures: tuple[Any, ...] = (),
     earlier: EarlierMap | None = None,
+    see_through: Collection[int] = (),
+    marks: Mapping[int, Blank] = NONE,
 ) -> Steps[Ground]:
     """Heights from tie points (level ground if there are none), refined by the sweep if one is
     given, and the grid of the map. `pictures` describes how the grey images are made; it is part of
     the key under which a swept surface is stored. Away from photos that changed, the heights of an
-    `earlier` map stay.
+    `earlier` map stay. `see_through`: photos (indices) with an alpha channel;
+    `marks`: where photos show marks.
 
     Raises:
         UsageError: the map would have no pixels, or far too many.
@@ -97,7 +105,9 @@ def find_ground(
     yield 0, 1
     xyz = alignment.ties.xyz
     flat = level(float(np.median(xyz[:, 2])) if len(xyz) else 0.0)
+    blanks, notes = _blanks(alignment, see_through, grey)
     limits = view_limits(alignment, flat, picture.max_view_angle)
+    limits = replace(limits, blanks=blanks, marks=marks)
     rough = make_views(alignment, flat, limits)
     if not rough:
         raise UsageError(
@@ -134,6 +144,7 @@ def find_ground(
             pictures,
             picture.max_view_angle,
             limits_for,
+            *((find_blanks, sorted(see_through)) if blanks else ()),
             *(() if grows is None else grows.key),
         )
         keep, tied = store.parts("surface", key, workers), [v for v in views if v.photo in held]
@@ -161,7 +172,19 @@ def find_ground(
         limits=limits,
         growth=grows,
         key=key,
+        notes=notes,
     )
+
+
+def _blanks(
+    alignment: Alignment, see_through: Collection[int], grey: GreyPicture
+) -> tuple[dict[int, Blank], tuple[str, ...]]:
+    """Where placed photos show nothing, and notes on them."""
+    cameras = {}
+    for i in sorted(alignment.poses):
+        camera = alignment.camera(i)
+        cameras[i] = alignment.camera_of[i], (camera.width, camera.height)
+    return find_blanks(cameras, see_through, grey)
 
 
 def view_limits(alignment: Alignment, flat: Surface, angle_deg: float) -> ViewLimits:

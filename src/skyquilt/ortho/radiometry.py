@@ -2,7 +2,7 @@
 reported.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.engine.kept import MADE_NOW, Keep
+from skyquilt.imaging.grey import to_grey8
 from skyquilt.imaging.nodes import View
 from skyquilt.model.photo import Photo
 from skyquilt.model.surface import Surface
@@ -86,6 +87,10 @@ class Levelling:
     """What is wanted."""
     keep: Keep = MADE_NOW
     """Keeps what takes long of large surveys."""
+    mixed: bool = False
+    """Whether some photos are grey and others in colours: then all bands of a photo are corrected
+    alike, so that neither are tinted.
+    """
 
     def __call__(self, ground: Ground) -> Exposure:
         """The photos' exposure, or the drift of measured values; neutral where neither is wanted.
@@ -112,7 +117,27 @@ class Levelling:
             )
         if not self.settings.balance or self.dtype != "uint8":
             return NEUTRAL
-        return self.balance(views, self.thumbnails, surface, bounds, self.keep)
+        small = _Grey(self.thumbnails) if self.mixed else self.thumbnails
+        return self.balance(views, small, surface, bounds, self.keep)
+
+
+class _Grey(Mapping[int, NDArray[Any]]):
+    """Small pictures, in three equal bands."""
+
+    def __init__(self, pictures: Mapping[int, NDArray[Any]]) -> None:
+        self._pictures = pictures
+
+    def __len__(self) -> int:
+        return len(self._pictures)
+
+    def __contains__(self, photo: object) -> bool:
+        return photo in self._pictures
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._pictures)
+
+    def __getitem__(self, photo: int) -> NDArray[Any]:
+        return np.repeat(to_grey8(self._pictures[photo])[..., None], 3, axis=2)
 
 
 def drift_of(

@@ -51,7 +51,7 @@ HIDDEN = np.float32(1e3)
 GRAZING = 0.3
 """Length of a cell in a photo, over that on level ground, below which it counts as hidden."""
 SMEARED = np.float32(5e2)
-"""Added where its pixels are smeared over the ground."""
+"""Added where its pixels are smeared over the ground, or show a mark."""
 SHADOWS_BYTES = 60_000_000
 """Bytes of hidden places of photos that are kept in memory."""
 
@@ -84,7 +84,7 @@ class SeamLines:
     """The same for a height of one metre or more above the surroundings, in grey values."""
     least: int = 24
     """Undisputed patches of fewer cells are contested too."""
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
 
     def __call__(
         self,
@@ -315,6 +315,8 @@ class _Scene:
             smear = smeared(n, 2 * self.cells.gsd / STEP)[near]
             if smear.any():  # what lies flat yields to sharper photos
                 own[densify(smear.astype(np.float32), *size, 2) > 0.5] += SMEARED
+            if (mark := view.limits.mark) is not None:  # so does what was written over the ground
+                own[densify(mark.at(n.u[near], n.v[near]), *size, 2) < 0] += SMEARED
             shadow = self._shadows(view.photo)
             if not shadow.empty:
                 x, y, z = fx[at], fy[at], over[at]

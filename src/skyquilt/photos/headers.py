@@ -220,6 +220,10 @@ class Header:
     """XMP properties."""
     jpeg: JpegHeader | None = None
     """The segments, of a JPEG."""
+    alpha: bool = False
+    """Whether pixels may be see-through."""
+    stored: str = ""
+    """Type of the values in the file (`int16`), of a TIFF."""
 
 
 def read_header(path: Path, *, most_mp: float = MOST_MP) -> Header:

@@ -5,7 +5,7 @@ Wrong ones are not used. Rounded and repeated ones get deviations as large as th
 do not shrink or turn a map.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +19,16 @@ _METRES_PER_DEGREE = 111_320.0
 FAR_M = 5_000.0
 FAR_STEPS = 20.0
 """A gap is longer than FAR_M and longer than so many times the way from a photo to the nearest."""
+NEAR = 0.01
+"""Positions whose signs or coordinates are exchanged must come nearer to the others than this share
+of their distance.
+"""
+_EXCHANGED: dict[str, Callable[[float, float], tuple[float, float]]] = {
+    "north and south": lambda north, east: (-north, east),
+    "east and west": lambda north, east: (north, -east),
+    "north and south, east and west": lambda north, east: (-north, -east),
+    "latitude and longitude": lambda north, east: (east, north),
+}
 _EARTH_M = _METRES_PER_DEGREE * 180 / np.pi
 _GROUND_M = 2.0
 _STUCK_M = 0.05
@@ -47,10 +57,44 @@ def without_outliers(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[
     for group in others:
         members = [photos[i] for i in group]
         far = np.linalg.norm(on_sphere(members) - middle, axis=1)
+        changed, said = _with_other_signs(members, middle, far, len(main))
+        if said:
+            notes.append(said)
+            for i, photo in zip(group, changed, strict=True):
+                kept[i] = photo
+            continue
         for i, distance in zip(group, far.tolist(), strict=True):
             kept[i] = _unplaced(photos[i], distance)
         notes += _told(members, far, len(main))
     return tuple(kept), tuple(notes)
+
+
+def _with_other_signs(
+    members: Sequence[Photo], middle: Array, far: NDArray[np.float64], main: int
+) -> tuple[list[Photo], str]:
+    """Photos far from `main` others at `middle`, where they lie near these once north and south,
+    east and west, or both coordinates are exchanged: a program lost the letter or the sign of some.
+    Empty text where they do not.
+    """
+    for words, change in _EXCHANGED.items():
+        moved = list[Photo]()
+        for photo in members:
+            if photo.position is None:
+                continue
+            latitude, longitude = change(photo.position.latitude_deg, photo.position.longitude_deg)
+            if abs(latitude) <= 90:
+                place = replace(photo.position, latitude_deg=latitude, longitude_deg=longitude)
+                moved.append(replace(photo, position=place))
+        if len(moved) == len(members) and (
+            np.linalg.norm(on_sphere(moved) - middle, axis=1).max() < NEAR * far.min()
+        ):
+            return moved, (
+                f"{len(members)} photos ({sentence_of([p.name for p in members])}) lie"
+                f" {np.median(far) / 1000:.0f} km from the {main} others, but among them once"
+                f" {words} are exchanged: so they are. If it is the others that are wrong, give"
+                " positions in a geo.txt."
+            )
+    return [], ""
 
 
 def _told(members: Sequence[Photo], far: NDArray[np.float64], main: int) -> list[str]:

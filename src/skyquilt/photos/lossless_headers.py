@@ -12,12 +12,16 @@ from skyquilt.outside import MOST_MP, check_picture
 from skyquilt.photos.headers import Dtype, Header
 from skyquilt.photos.tags import MOST_XMP, Directories, parse_exif, parse_xmp, read_tiff_tags
 
+_PNG_BITS = 24
+"""Byte of a PNG that says how many bits a value has."""
 MOST_CHUNKS = 100_000
 """Largest number of chunks of a PNG."""
 _WIDTH, _HEIGHT, _BITS, _CODEC, _SAMPLES = 256, 257, 258, 259, 277
 _STRIPS, _TILES, _XMP_TAG = 273, 324, 700
 _CODECS = frozenset({1, 5, 7, 8, 32773, 32946, 34925, 50000})
 """None, LZW, JPEG, Deflate, PackBits, Deflate (old), LZMA, Zstandard."""
+_STRANGE_COLOURS, _YCBCR, _JPEGS = frozenset({8, 9, 10, 32844, 32845}), 6, frozenset({6, 7})
+"""CIELAB and its kin, logarithmic light; YCbCr, which is decoded as RGB within JPEG only."""
 MOST_STRIPS = 1_000_000
 """Largest number of strips or tiles of a TIFF."""
 
@@ -69,14 +73,24 @@ def read_tiff(file: BinaryIO, most_mp: float) -> Header:
             else b""
         )
         alpha = sum(int(e) in (1, 2) for e in page.extrasamples)
+        kind = int(page.photometric)
+        if kind in _STRANGE_COLOURS or (kind == _YCBCR and int(page.compression) not in _JPEGS):
+            raise UnreadablePhotoError(
+                "its colours are stored in a way that is not read (photometric interpretation"
+                f" {kind}); save it as RGB"
+            )
+        inks = kind == tifffile.PHOTOMETRIC.SEPARATED and page.dtype == np.uint8
+        coloured = inks or kind == tifffile.PHOTOMETRIC.PALETTE
         return Header(
             kind="tiff",
             width=int(page.imagewidth),
             height=int(page.imagelength),
-            channels=int(page.samplesperpixel) - alpha,
-            dtype=_stored_as(page.dtype),
+            channels=3 if coloured else int(page.samplesperpixel) - alpha,
+            dtype="uint8" if coloured else _stored_as(page.dtype),
             exif=exif,
             xmp=parse_xmp((packet,) if isinstance(packet, bytes) and packet else ()),
+            alpha=alpha > 0,
+            stored=page.dtype.name,
         )
 
 
@@ -111,6 +125,7 @@ def check_png(file: BinaryIO, most_mp: float = MOST_MP) -> None:
     width, height = (int.from_bytes(head[k : k + 4], "big") for k in (8, 12))
     # Pillow keeps four bytes for a pixel that is not grey, and the result is a copy
     bytes_per_px = {0: 4.0, 4: 6.0, 2: 7.0, 3: 5.0}.get(head[17], 11.0)
+    bytes_per_px *= 2 if head[16] == 16 else 1
     check_picture(width, height, bytes_per_px, file_bytes=size, most_mp=most_mp)
     file.seek(8)
     for _ in range(MOST_CHUNKS):
@@ -132,12 +147,15 @@ def read_png(file: BinaryIO, most_mp: float) -> Header:
         packet = packet.encode() if isinstance(packet, str) else packet
         block = image.info.get("exif") or b""
         gray = image.mode in ("1", "L", "LA") or image.mode.startswith(("I", "F"))
+        file.seek(_PNG_BITS)
+        deep = file.read(1) == b"\x10"
         return Header(
             kind="png",
             width=image.width,
             height=image.height,
             channels=1 if gray else 3,
-            dtype="uint16" if image.mode.startswith("I") else "uint8",
+            dtype="uint16" if deep else "uint8",
             exif=parse_exif(block.removeprefix(b"Exif\x00\x00")),
             xmp=parse_xmp((packet,) if packet else ()),
+            alpha=image.has_transparency_data and (not deep or image.mode in ("LA", "RGBA")),
         )

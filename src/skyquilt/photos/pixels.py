@@ -12,6 +12,7 @@ from typing import Any, BinaryIO, Literal
 import cv2
 import numpy as np
 import simplejpeg
+from imagecodecs import png_decode
 from numpy.typing import NDArray
 
 from skyquilt.errors import UnreadablePhotoError
@@ -128,8 +129,11 @@ def _decode(photo: Photo, reduction: Reduction, *, gray: bool) -> Pixels:
             return decode_jpeg(data, gray=gray or photo.channels == 1, reduction=reduction)
         if head == b"\x89PNG":
             return reduce_pixels(_png(file, photo), reduction)
-        pixels = read_tiff(file, size)[..., : photo.channels]
-    pixels = pixels[..., 0] if photo.channels == 1 else pixels
+        pixels = read_tiff(file, size)
+    if photo.channels == 1:
+        pixels = pixels[..., 0]
+    elif photo.channels == 3 and pixels.shape[2] == 1:  # grey among photos in colour
+        pixels = np.repeat(pixels, 3, axis=2)
     return reduce_pixels(
         thermal_frame_of_values(pixels, photo.stored).values if photo.unit else pixels, reduction
     )
@@ -172,18 +176,38 @@ def _thermal_jpeg(path: Path) -> Pixels:
 
 
 def _png(file: BinaryIO, photo: Photo) -> Pixels:
+    """The pixels of a PNG; see-through ones are black."""
     from PIL.PngImagePlugin import PngImageFile  # most photos are JPEGs
 
     with PngImageFile(file) as image:
         _same_size(image.size, (photo.width, photo.height))
-        if image.mode.startswith("I"):
-            return np.asarray(image, dtype=np.uint16)
-        return np.asarray(image.convert("L" if photo.channels == 1 else "RGB"))
+        if photo.dtype == "uint16":  # of colours, Pillow would keep 8 bits
+            file.seek(0)
+            pixels = np.asarray(png_decode(file.read()))
+        else:
+            mode = "L" if photo.channels == 1 else "RGB"
+            mode = mode if not photo.alpha else "LA" if mode == "L" else "RGBA"
+            pixels = np.asarray(image.convert(mode))
+    if photo.alpha:
+        pixels = _emptied(pixels[..., :-1], pixels[..., -1])
+        pixels = pixels[..., 0] if photo.channels == 1 else pixels
+    return pixels
+
+
+def _emptied(pixels: Pixels, alpha: Pixels) -> Pixels:
+    """Pixels (h, w[, bands]) in which those that alpha (h, w) makes see-through hold no value: a
+    program may have left anything there.
+    """
+    most = np.iinfo(alpha.dtype).max if alpha.dtype.kind == "u" else max(float(alpha.max()), 1e-9)
+    empty = np.nan if pixels.dtype.kind == "f" else 0
+    shown = (alpha >= most / 2).reshape(*alpha.shape, *(1,) * (pixels.ndim - 2))
+    return np.where(shown, pixels, np.asarray(empty, pixels.dtype))
 
 
 def read_tiff(file: BinaryIO, size: tuple[int, int]) -> Pixels:
-    """The first page of a TIFF as (height, width, bands), signed and wide types as float32, black
-    and white as 0 and 255; `size`: the width and height that were checked.
+    """The first page of a TIFF as (height, width, bands) without alpha, signed and wide types as
+    float32, black and white as 0 and 255, palettes and inks as RGB, see-through pixels as black or
+    NaN; `size`: the width and height that were checked.
     """
     import tifffile  # imported here because most photos are JPEGs
 
@@ -192,11 +216,24 @@ def read_tiff(file: BinaryIO, size: tuple[int, int]) -> Pixels:
         _same_size((int(page.imagewidth), int(page.imagelength)), size)
         pixels = np.asarray(page.asarray(maxworkers=1))
         planar = page.planarconfig == 2 and pixels.ndim == 3
-        white = int(page.photometric) != tifffile.PHOTOMETRIC.MINISWHITE
+        kind, palette = int(page.photometric), page.colormap
+        alpha = [int(e) in (1, 2) for e in page.extrasamples]
     if planar:
         pixels = np.moveaxis(pixels, 0, -1)
     if pixels.dtype == np.bool_:  # one bit for each pixel; `white` is the one that stands for it
+        white = kind != tifffile.PHOTOMETRIC.MINISWHITE
         pixels = np.where(pixels == white, 255, 0).astype(np.uint8)
+    elif pixels.dtype == np.uint8 and kind == tifffile.PHOTOMETRIC.MINISWHITE:
+        pixels = np.uint8(255) - pixels
     if pixels.dtype not in (np.uint8, np.uint16):
         pixels = pixels.astype(np.float32)
-    return np.ascontiguousarray(pixels if pixels.ndim == 3 else pixels[..., None])
+    pixels = pixels if pixels.ndim == 3 else pixels[..., None]
+    if kind == tifffile.PHOTOMETRIC.PALETTE and palette is not None:
+        pixels = np.moveaxis(palette[:, pixels[..., 0]] // 257, 0, -1).astype(np.uint8)
+    elif kind == tifffile.PHOTOMETRIC.SEPARATED and pixels.dtype == np.uint8:
+        light = np.uint16(255) - pixels[..., :4]
+        pixels = ((light[..., :3] * light[..., 3:] + np.uint16(127)) // 255).astype(np.uint8)
+    elif True in alpha:
+        kinds = [*[False] * (pixels.shape[2] - len(alpha)), *alpha]
+        pixels = _emptied(pixels[..., np.invert(kinds)], pixels[..., kinds.index(True)])
+    return np.ascontiguousarray(pixels)

@@ -41,6 +41,7 @@ from skyquilt.photos.pixels import read_tiff
 from skyquilt.photos.shutter import find_shutter
 from skyquilt.photos.thermal import (
     ThermalFrame,
+    like_reflectance,
     stated_unit,
     thermal_frame_of_jpeg,
     thermal_frame_of_values,
@@ -195,6 +196,7 @@ def _photo(path: Path, name: str, header: Header, thermal_unit: str | None) -> P
         height=height,
         channels=1 if frame else header.channels,
         dtype="float32" if frame else header.dtype,
+        alpha=header.alpha,
         band="thermal" if lens.thermal else "visible",
         unit=frame.unit if frame else "",
         stored=frame.stored if frame else "",
@@ -283,13 +285,15 @@ def _thermal_frame(path: Path, header: Header, said: str | None) -> ThermalFrame
     )
     known = said is not None or bool(stored) or _is_lwir(header)
     known = known or (sensor is not None and sensor.band == "thermal")
-    if not known and header.dtype != "float32":
+    if not known and (not header.stored.startswith("float") or _band_name(header)):
         return None
     check_picture(header.width, header.height, 4, most_mp=MOST_THERMAL_MP, option="")
     try:
         with open_regular(path) as file:
             values = read_tiff(file, (header.width, header.height))[..., 0]
-        frame = thermal_frame_of_values(np.asarray(values), stored)
+        if not known and like_reflectance(values):
+            return None
+        frame = thermal_frame_of_values(np.asarray(values), stored, header.stored)
     except Exception as error:  # tifffile raises many exceptions; all mean: no pixels
         raise UnreadablePhotoError(f"its pixels cannot be decoded ({error})") from error
     return frame if known or frame.unit == "celsius" else None

@@ -25,6 +25,7 @@ from skyquilt.photos.read import ReadPhoto, read_photo
 from skyquilt.photos.recoded import UNNAMED, recoded
 from skyquilt.photos.side_files import apply_positions
 from skyquilt.photos.side_rows import sentence_of
+from skyquilt.photos.thermal import UNSTATED
 from skyquilt.video.read import CLIP_ENDINGS, side_files
 
 _PHOTO_ENDINGS = frozenset({".jpg", ".jpeg", ".tif", ".tiff", ".png"})
@@ -184,7 +185,8 @@ def read_survey(
     if cameras:
         photos, more = apply_cameras(photos, read_cameras_json(cameras), file=cameras)
         notes = (*notes, *more)
-    photos, implausible = placed_plausibly(_with_editors(photos))
+    photos, greyed = _in_colour(_with_editors(photos))
+    photos, implausible = placed_plausibly(photos)
     return Survey(
         photos=photos,
         rejected=tuple(sorted((*rejected, *copies, *reduced), key=lambda r: r.name)),
@@ -197,6 +199,7 @@ def read_survey(
             *_run_notes(found),
             *_closed_note(found),
             *_unread_notes(found),
+            *greyed,
             *implausible,
             *survey_notes(photos, len(copies) + len(reduced)),
         ),
@@ -220,6 +223,23 @@ def _with_editors(photos: Sequence[Photo]) -> tuple[Photo, ...]:
     return tuple(
         replace(p, editor=UNNAMED) if changed and p.editor is None else p
         for p, changed in zip(photos, other, strict=True)
+    )
+
+
+def _in_colour(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
+    """The photos, those saved in grey of a camera whose others are in colour to be read as
+    colours, too, so that one map shows both; and a note on these.
+    """
+    plain = [p for p in photos if p.dtype == "uint8" and not (p.unit or p.band_name)]
+    coloured = {p.camera_key for p in plain if p.channels == 3}
+    grey = {p.name for p in plain if p.channels == 1 and p.camera_key in coloured}
+    if not grey:
+        return tuple(photos), ()
+    read = [replace(p, channels=3, saved_grey=True) if p.name in grey else p for p in photos]
+    return tuple(read), (
+        f"{len(grey)} photos are grey, though others of their camera are in colour:"
+        f" {sentence_of(sorted(grey))}. They are mapped together, and stay grey; for a map in"
+        " colours, leave them out.",
     )
 
 
@@ -329,6 +349,12 @@ def _cameras(photos: Sequence[Photo]) -> Iterator[str]:
     rolling = sorted({p.camera_key for p in photos if p.rolling_shutter})
     if rolling:
         yield f"Rolling (electronic) shutter: {sentence_of(rolling)}."
+    deep = sum(p.dtype != "uint8" and p.channels == 3 for p in photos)
+    if deep:
+        yield (
+            f"{deep} photos in colour have 16 bits or more: their values are mapped as recorded,"
+            " without a balance of brightness; for one, save them with 8 bits."
+        )
 
 
 def _thermal_units(photos: Sequence[Photo]) -> Iterator[str]:
@@ -340,19 +366,16 @@ def _thermal_units(photos: Sequence[Photo]) -> Iterator[str]:
             " --thermal-unit."
         )
     elif units:
-        yield f"Thermal TIFFs are read as {listed.split(' as ')[1]} ({sum(units.values())})."
+        guessed = next((f" {n}" for p in photos for n in p.notes if UNSTATED in n), "")
+        unit = listed.split(" as ")[1]
+        yield f"Thermal TIFFs are read as {unit} ({sum(units.values())}).{guessed}"
     untold = [
-        p
-        for p in photos
-        if p.dtype == "uint16"
-        and p.channels == 1
-        and not p.unit
-        and p.camera_key.startswith("unknown camera")
+        p for p in photos if p.dtype != "uint8" and p.channels == 1 and not (p.unit or p.band_name)
     ]
     if untold:
         yield (
-            f"{len(untold)} photos have one band of 16 bits and state neither unit nor maker: they"
-            " are mapped as brightness; if they are temperatures, give --thermal-unit."
+            f"{len(untold)} photos have one band of 16 bits or more and state no unit: they are"
+            " mapped as brightness; if they are temperatures, give --thermal-unit."
         )
 
 

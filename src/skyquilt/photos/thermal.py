@@ -1,8 +1,8 @@
 """Radiometric thermal frames: the raw data, never the displayed palette."""
 
 import re
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,12 @@ _CENTIKELVIN = (22_000, 42_000)
 _DECIKELVIN = (2_200, 4_200)
 _KELVIN = (220.0, 420.0)
 _CELSIUS = (-60.0, 160.0)
+_REFLECTANCE = (-0.1, 1.5)
+_DECICELSIUS, _CENTICELSIUS = 600.0, 6000.0
 _KELVIN_PER = {"kelvin": 1.0, "decikelvin": 0.1, "centikelvin": 0.01}
+_CELSIUS_PER = {"celsius": 1.0, "decicelsius": 0.1, "centicelsius": 0.01}
+UNSTATED = "no unit is stated (set it with --thermal-unit)"
+"""Part of the note on a frame whose unit follows from its values."""
 _STATED = re.compile(
     r"""\bunit\s*[:=]\s*["']?([a-z]+)|role=["']unittype["'][^>]*>\s*([^<]+?)\s*<""", re.IGNORECASE
 )
@@ -31,6 +36,8 @@ _WORDS: dict[str, Stored] = {
     "decikelvin": "decikelvin",
     "centikelvin": "centikelvin",
     "ck": "centikelvin",
+    "decicelsius": "decicelsius",
+    "centicelsius": "centicelsius",
     "counts": "counts",
     "dn": "counts",
 }
@@ -91,45 +98,69 @@ def stated_unit(text: str) -> Stored:
     return _WORDS.get(word, "")
 
 
-def thermal_frame_of_values(values: NDArray[np.generic], stored: Stored = "") -> ThermalFrame:
+def thermal_frame_of_values(
+    values: NDArray[np.generic], stored: Stored = "", kind: str = ""
+) -> ThermalFrame:
     """Degrees Celsius from a single-band thermal TIFF whose values mean `stored`.
 
     Where the meaning is not stated, it is derived from the median value. Integers: hundredths or
-    tenths of a kelvin; real numbers: kelvin or degrees Celsius; otherwise counts.
+    tenths of a kelvin, and if they have a sign also of a degree Celsius; real numbers: kelvin or
+    degrees Celsius; otherwise counts. `kind`: type of the values in the file (`int16`), where they
+    were converted.
     """
+    kind = kind or values.dtype.name
+    whole = kind.startswith(("int", "uint"))
     real = values.astype(np.float32)
-    whole = values.dtype.kind in "iu"
-    if whole:
+    if kind.startswith("uint"):
         real[values == 0] = np.nan
     if stored:
         note = f"Its values are read as {stored}, as stated by the file or --thermal-unit."
         return _frame(real, stored, note)
-    finite = real[np.isfinite(real)]
+    finite = real[np.isfinite(real) & ((real != 0) | (not whole))]
     middle = float(np.median(finite)) if finite.size else float("nan")
-    found = _likely(middle, whole=whole)
+    found = _likely(middle, whole=whole, signed=kind.startswith("int"))
     if found == "counts":
         words = (
             "fits no unit of temperature: values are counts, unless --thermal-unit states their"
             " unit."
         )
-    else:
-        words = f"fits {found}; no unit is stated (set it with --thermal-unit)."
-    return _frame(real, found, f"Its median value {middle:g} {words}")
+        return _frame(real, found, f"Its median value {middle:g} {words}")
+    frame = _frame(real, found, "")
+    degrees = float(np.nanmedian(frame.values))
+    words = f"fits {found}, {degrees:.1f} degrees Celsius; {UNSTATED}."
+    return replace(frame, note=f"Its median value {middle:g} {words}")
 
 
-def _likely(middle: float, *, whole: bool) -> Stored:
+def like_reflectance(values: NDArray[np.floating[Any]]) -> bool:
+    """Whether real numbers are shares of light, or an index of such: nearly all lie between 0 and
+    1, where temperatures of a whole frame hardly do.
+    """
+    finite = values[np.isfinite(values)]
+    low, high = np.percentile(finite, [1, 99]) if finite.size else (np.nan, np.nan)
+    return bool(_REFLECTANCE[0] <= low and high <= _REFLECTANCE[1])
+
+
+def _likely(middle: float, *, whole: bool, signed: bool) -> Stored:
     """The unit in which a median value is a plausible temperature on Earth."""
     ranges: tuple[tuple[tuple[float, float], Stored], ...] = (
         ((_CENTIKELVIN, "centikelvin"), (_DECIKELVIN, "decikelvin"))
         if whole
         else ((_KELVIN, "kelvin"), (_CELSIUS, "celsius"))
     )
+    if signed:
+        more: tuple[tuple[tuple[float, float], Stored], ...] = (
+            ((-_DECICELSIUS, _DECICELSIUS), "decicelsius"),
+            ((-_CENTICELSIUS, _CENTICELSIUS), "centicelsius"),
+        )
+        ranges = (*ranges, *more)
     return next((unit for (low, high), unit in ranges if low <= middle <= high), "counts")
 
 
 def _frame(real: NDArray[np.float32], stored: Stored, note: str) -> ThermalFrame:
-    if stored == "counts":
-        return ThermalFrame(values=real, unit="counts", note=note, stored=stored)
-    if stored != "celsius":
+    if stored in _KELVIN_PER:
+        real[real <= 0] = np.nan
         real = real * np.float32(_KELVIN_PER[stored]) - np.float32(273.15)
-    return ThermalFrame(values=real, unit="celsius", note=note, stored=stored)
+    elif stored in _CELSIUS_PER and stored != "celsius":
+        real = real * np.float32(_CELSIUS_PER[stored])
+    unit: Literal["celsius", "counts"] = "counts" if stored == "counts" else "celsius"
+    return ThermalFrame(values=real, unit=unit, note=note, stored=stored)

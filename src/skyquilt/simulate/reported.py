@@ -33,7 +33,7 @@ class Place:
 
 def place_at(latitude: float, longitude: float) -> Place:
     """The map frame whose origin is the position rounded to whole metres, in its UTM zone."""
-    zone = int((longitude + 180) // 6) + 1
+    zone = int((longitude + 180) % 360 // 6) + 1
     crs = f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}"
     to = Transformer.from_crs("EPSG:4326", crs, always_xy=True)
     easting, northing = to.transform(longitude, latitude)

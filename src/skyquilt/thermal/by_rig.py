@@ -14,6 +14,7 @@ from skyquilt.coregistration.workflow import outcome_of
 from skyquilt.errors import PhotoFailedError
 from skyquilt.geometry.transforms import transfer
 from skyquilt.imaging.grey import shrink
+from skyquilt.imaging.nodes import View
 from skyquilt.imaging.views import make_views
 from skyquilt.model.photo import Photo, RejectedPhoto, Survey
 from skyquilt.model.poses import Alignment, Pose, no_ties
@@ -23,6 +24,7 @@ from skyquilt.ortho.blend import Blend
 from skyquilt.ortho.companions import geotransform
 from skyquilt.ortho.compose import Composer
 from skyquilt.ortho.exposure import NEUTRAL, Exposure
+from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.radiometry import DriftMethod, balances_drift, drift_of, value_tags
 from skyquilt.photos.pixels import lost, read_color
 from skyquilt.photos.read import rejected
@@ -176,9 +178,14 @@ def drift_of_rigged(
     unit, ground = found.photos[0].unit, scene.ground
     if not balances_drift(settings, unit):
         return NEUTRAL
-    views = make_views(found.alignment, ground.surface, ground.limits)
+    views = _views(found, ground)
     frames = {v.photo: shrink(_pixels(found.photos[v.photo]), THUMBNAIL)[0] for v in views}
     return drift_of(views, frames, ground.surface, ground.grid.bounds, unit, drift, settings)
+
+
+def _views(found: Rigged, ground: Ground) -> list[View]:
+    """What the thermal frames see within the limits of the visual photos."""
+    return make_views(found.alignment, ground.surface, replace(ground.limits, blanks={}, marks={}))
 
 
 def draw_rigged(
@@ -191,7 +198,7 @@ def draw_rigged(
     kind, real = np.dtype(first.dtype), np.dtype(first.dtype).kind == "f"
     compose = Composer(
         grid=grid,
-        views=make_views(found.alignment, scene.ground.surface, scene.ground.limits),
+        views=_views(found, scene.ground),
         surface=scene.ground.surface,
         blend=blend,
         pixels=lambda i: _pixels(found.photos[i]),

@@ -23,6 +23,7 @@ from skyquilt.engine.free_memory import give_back
 from skyquilt.engine.pixel_cache import PixelCache, pixel_budget, resident_budget
 from skyquilt.engine.store import Store
 from skyquilt.engine.workers import Workers
+from skyquilt.imaging.blank import marked
 from skyquilt.model.event import Event, Note
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.poses import Alignment, MapFrame, Prior
@@ -253,6 +254,8 @@ def find_ground(
     earlier = None
     if aligned.earlier is not None and output is not None:
         earlier = aligned.earlier.map_of(aligned.photos, clock.store, output)
+    marks = aligned.links.marks
+    shown = {name: marked(mask, marks.cell_px[name]) for name, mask in marks.masks.items()}
     steps = ground.find_ground(
         aligned.alignment,
         aligned.grey,
@@ -263,6 +266,10 @@ def find_ground(
         clock.workers,
         pictures=picture_recipe(),
         earlier=earlier,
+        see_through=[i for i, p in enumerate(aligned.photos) if p.alpha],
+        marks={
+            i: shown[p.camera_key] for i, p in enumerate(aligned.photos) if p.camera_key in shown
+        },
     )
     return (yield from clock.stage("surface", steps))
 
@@ -336,6 +343,7 @@ def _exposure(
         drift=methods.drift,
         settings=picture,
         keep=store.parts("balance", key),
+        mixed=any(p.saved_grey for p in aligned.photos),
     )
     return store.get_or("balance", key, lambda: levelled(on))
 

@@ -85,6 +85,7 @@ def labels_key(
         methods.seams,
         picture_recipe(),
         [p.digest for p in photos],
+        *([(i, m.room) for i, m in sorted(ground.limits.marks.items())]),
         *_growth(ground),
     )
 

@@ -391,7 +391,7 @@ def _metrics(
                 *tilt_warnings(aligned.priors, alignment),
                 *stretch_warnings(alignment.frame),
             ],
-            notes=[*survey.notes, *alignment.notes],
+            notes=[*survey.notes, *alignment.notes, *ground.notes],
         )
         | {
             "heights": height_figures(

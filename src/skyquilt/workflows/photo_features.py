@@ -354,7 +354,7 @@ def of_one_kind(found: FeaturedPhotos) -> FeaturedPhotos:
             " photos in a folder of their own, with --thermal"
             if p.band != common[2]
             else f"its pixels ({p.channels} x {p.dtype}, {p.band}) differ from the survey's"
-            f" ({common[0]} x {common[1]}, {common[2]})",
+            f" ({common[0]} x {common[1]}, {common[2]}); save all as one kind, or map it by itself",
         )
         for p, k in zip(found.photos, kinds, strict=True)
         if k != common
