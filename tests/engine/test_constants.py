@@ -78,6 +78,10 @@ IN_NO_KEY = {
         + ("TASK_S", "MOST_ITEMS", "LOOKED"),
         "who computes does not change what is computed",
     ),
+    **dict.fromkeys(
+        ("SHOWN_SAMPLE_PX", "SHOWN_REACH_PX", "SHOWN_NODES_PX", "SHOWN_RIM_PX"),
+        "how much of a photo is kept in memory: more is decoded where it is asked for",
+    ),
 }
 """Constants of the stages that no method's key holds, and why that is right."""
 

@@ -15,13 +15,13 @@ from skyquilt.model.surface import Surface
 from skyquilt.ortho.compose import PIECE
 from skyquilt.ortho.labels import Labels
 
-SAMPLE_PX = 32
+SHOWN_SAMPLE_PX = 32
 """Map pixels between the places whose labels and heights are looked at."""
-REACH_PX = 64
+SHOWN_REACH_PX = 64
 """Map pixels around a place that shows a photo over which it may be drawn, too."""
-NODES_PX = 1.5 * STEP
+SHOWN_NODES_PX = 1.5 * STEP
 """Map pixels beyond a block at which photos are projected."""
-RIM_PX = 8
+SHOWN_RIM_PX = 8
 """Photo pixels around the part, which interpolation looks at."""
 
 
@@ -29,9 +29,9 @@ def shown_parts(
     labels: Labels, views: Sequence[View], surface: Surface, block: int
 ) -> dict[int, dict[tuple[int, int], Box]]:
     """What the blocks of a map, of `block` px, show of photos: by the photo's index, and by the
-    first row and column of the block. Strips narrower than `SAMPLE_PX` may be missed.
+    first row and column of the block. Strips narrower than `SHOWN_SAMPLE_PX` may be missed.
     """
-    step = max(1, SAMPLE_PX // labels.factor)
+    step = max(1, SHOWN_SAMPLE_PX // labels.factor)
     side = max(1, PIECE // (step * labels.factor))
     samples, pieces = labels.cells.coarser(step), labels.cells.coarser(step * side)
     x, y = samples.x(np.arange(samples.width)), samples.y(np.arange(samples.height))
@@ -40,7 +40,7 @@ def shown_parts(
     around = np.ones((3, 3), np.uint8)
     levels = np.stack([cv2.erode(_lowest(z, side), around), -cv2.erode(_lowest(-z, side), around)])
     px = step * labels.factor
-    reach = np.array([-REACH_PX, px + REACH_PX])
+    reach = np.array([-SHOWN_REACH_PX, px + SHOWN_REACH_PX])
     out: dict[int, dict[tuple[int, int], Box]] = {}
     for view, r, c in _shown_at(labels.photo[step // 2 :: step, step // 2 :: step], views):
         piece = r // side * pieces.width + c // side
@@ -55,7 +55,7 @@ def shown_parts(
         own = out.setdefault(view.photo, {})
         for row, column in _blocks(rows, columns, block, samples.height * px, samples.width * px):
             y, x = (
-                np.clip(at, corner - NODES_PX, corner + block + NODES_PX) / px - 0.5
+                np.clip(at, corner - SHOWN_NODES_PX, corner + block + SHOWN_NODES_PX) / px - 0.5
                 for at, corner in ((rows, row), (columns, column))
             )
             here = (y[:, 1] > y[:, 0]) & (x[:, 1] > x[:, 0])
@@ -105,5 +105,5 @@ def _shown_at(
 
 def _span(at: NDArray[Any], size: int) -> slice:
     """The pixels, at least one of `size`, between places in a photo, and a rim."""
-    start = int(np.clip(np.floor(at.min()) - RIM_PX, 0, size - 1))
-    return slice(start, int(np.clip(np.ceil(at.max()) + RIM_PX + 1, start + 1, size)))
+    start = int(np.clip(np.floor(at.min()) - SHOWN_RIM_PX, 0, size - 1))
+    return slice(start, int(np.clip(np.ceil(at.max()) + SHOWN_RIM_PX + 1, start + 1, size)))

@@ -6,7 +6,7 @@ each band: a map of all of them would be a patchwork of bands, so it shows one.
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import PurePosixPath
 
@@ -21,6 +21,19 @@ SAME = 0.03
 """... the same shape and the same angle of view, within this share."""
 PREFERRED = ("green", "red")
 """Bands that are shown before others of as many photos: lawns, fields and roads differ in them."""
+
+
+def without_copies(photos: Iterable[Photo]) -> tuple[tuple[Photo, ...], tuple[RejectedPhoto, ...]]:
+    """The photos, by name, without files of the same content as others, and these."""
+    first: dict[str, Photo] = {}
+    copies = []
+    for photo in sorted(photos, key=lambda p: p.name):
+        original = first.setdefault(photo.digest, photo)
+        if original is not photo:
+            copies.append(
+                RejectedPhoto(name=photo.name, reason=f"same file content as {original.name}")
+            )
+    return tuple(first.values()), tuple(copies)
 
 
 def without_reduced(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[RejectedPhoto, ...]]:

@@ -2,7 +2,7 @@
 
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import pairwise
@@ -19,7 +19,7 @@ from skyquilt.photos.implausible_positions import (
     without_outliers,
     without_stuck,
 )
-from skyquilt.photos.left_out import band_note, without_reduced
+from skyquilt.photos.left_out import band_note, without_copies, without_reduced
 from skyquilt.photos.metadata import INVALID, NO_HEMISPHERE
 from skyquilt.photos.read import ReadPhoto, read_photo
 from skyquilt.photos.recoded import UNNAMED, recoded
@@ -174,7 +174,7 @@ def read_survey(
     rejected = [p for p in files if isinstance(p, RejectedPhoto)]
     films, more_rejected = read_clips(found.clips, geo) if clips else ((), ())
     rejected += more_rejected
-    photos, copies = _without_copies(p for p in files if isinstance(p, Photo))
+    photos, copies = without_copies(p for p in files if isinstance(p, Photo))
     photos, reduced = without_reduced(photos)
     if not photos and not films:
         raise NoPhotosError(_nothing_sentence(folder, found, rejected, clips=clips))
@@ -247,18 +247,6 @@ def capture_order(photo: Photo) -> tuple[bool, datetime, str]:
     """Sort key: wall-clock time, then name; photos without a time come last."""
     time = photo.time.replace(tzinfo=None) if photo.time else datetime.max
     return photo.time is None, time, photo.name
-
-
-def _without_copies(photos: Iterable[Photo]) -> tuple[tuple[Photo, ...], tuple[RejectedPhoto, ...]]:
-    first: dict[str, Photo] = {}
-    copies = []
-    for photo in sorted(photos, key=lambda p: p.name):
-        original = first.setdefault(photo.digest, photo)
-        if original is not photo:
-            copies.append(
-                RejectedPhoto(name=photo.name, reason=f"same file content as {original.name}")
-            )
-    return tuple(first.values()), tuple(copies)
 
 
 def _run_notes(found: FoundFiles) -> tuple[str, ...]:
