@@ -53,7 +53,7 @@ def window(row, column):
 def test_a_photo_is_decoded_once_and_the_map_is_that_of_whole_photos(scene, surface, monkeypatch):
     for module in ("compose", "shown_parts"):
         monkeypatch.setattr(f"skyquilt.ortho.{module}.PIECE", 64)
-    monkeypatch.setattr("skyquilt.ortho.shown_parts.SAMPLE_PX", 8)
+    monkeypatch.setattr("skyquilt.ortho.shown_parts.SHOWN_SAMPLE_PX", 8)
     views, pictures = scene
     labels = nearest(views)
     shown = shown_parts(labels, views, surface, BLOCK)
