@@ -2,11 +2,11 @@
 
 The grid is WW15MGH of NIMA and NASA (Lemoine et al. 1998), 15 minutes, as PROJ ships it
 (`egm96_15.gtx` of the package proj-data 9.1.1; a work of the US government, in the public domain).
-It is stored in `egm96_15.xz` in whole millimetres, the resolution of the original: second
+It is stored in `egm96_15.zlib` in whole millimetres, the resolution of the original: second
 differences of both axes as 32-bit integers, split by bytes.
 """
 
-import lzma
+import zlib
 from functools import cache
 from importlib.resources import files
 
@@ -26,8 +26,8 @@ def egm96_grid() -> NDArray[np.int32]:
     """(721, 1440) heights of the geoid in mm: rows from 90 degrees south northwards, columns from
     180 degrees west eastwards.
     """
-    packed = (files("skyquilt.geometry") / "egm96_15.xz").read_bytes()
-    planes = np.frombuffer(lzma.decompress(packed), np.uint8).reshape(4, ROWS, COLUMNS)
+    packed = (files("skyquilt.geometry") / "egm96_15.zlib").read_bytes()
+    planes = np.frombuffer(zlib.decompress(packed), np.uint8).reshape(4, ROWS, COLUMNS)
     grid = np.ascontiguousarray(planes.transpose(1, 2, 0)).view("<i4")[..., 0]
     for _ in range(2):
         grid = np.cumsum(np.cumsum(grid, 1, np.int32), 0, np.int32)
