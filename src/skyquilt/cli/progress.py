@@ -6,18 +6,20 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from skyquilt.live.events import Update
 from skyquilt.model.event import Event, Note, Result, StageFinished, StageProgress, StageStarted
 from skyquilt.outside import shown
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from skyquilt.live.events import Update
     from skyquilt.runs.export import Export
 
 
-def show_live(events: Iterable[Event | Update], url: str, *, mode: str) -> None:
+def show_live(events: Iterable["Event | Update"], url: str, *, mode: str) -> None:
     """Consumes the events; mode `normal`, `quiet` or `json`."""
+    from skyquilt.live.events import Update  # not loaded for `mosaic`
+
     if mode == "json":
         _line({"event": "ServerThread", "url": url})
     elif mode == "normal":
@@ -39,8 +41,10 @@ def _line(record: dict[str, object]) -> None:
     sys.stdout.flush()
 
 
-def sentence(happened: Event | Update) -> str:
+def sentence(happened: "Event | Update") -> str:
     """The line to print for an event; empty for events that are not printed."""
+    from skyquilt.live.events import Update
+
     if isinstance(happened, Note):
         return happened.text
     if isinstance(happened, Result):
