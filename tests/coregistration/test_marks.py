@@ -55,7 +55,7 @@ def bare(seed, contrast=1.0):
     return np.clip(grey, 0, 255).astype(np.uint8)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(s, marks=pytest.mark.slow) for s in (1, 2, 3))])
 def test_unrelated_pictures_are_not_registered_by_marks(auto, seed):
     a, b = (Picture(values=marked(bare(s, contrast=0.2))) for s in (seed, seed + 20))
     naive = auto.method(a, b)
@@ -65,7 +65,7 @@ def test_unrelated_pictures_are_not_registered_by_marks(auto, seed):
     assert "significance" in found.reason or "marks" in found.reason or "position" in found.reason
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(s, marks=pytest.mark.slow) for s in (1, 2))])
 def test_the_scene_is_registered_in_spite_of_marks(auto, seed):
     truth = turned(1.05, 8.0 - 5 * seed, SHAPE, SHAPE, (15.0, -12.0))
     a, b = pair(truth, seed=seed)
