@@ -6,6 +6,8 @@ import sys
 
 import pytest
 
+from skyquilt.engine import free_memory
+
 PROGRAM = """
 from pathlib import Path
 from skyquilt.engine.free_memory import give_back
@@ -33,6 +35,24 @@ def test_holes_are_given_back():
     alone, asked = map(int, done.stdout.split())
     assert alone < 20e6  # of 120 MB freed, hardly anything went back by itself
     assert asked > 80e6
+
+
+def test_it_is_looked_for_where_memory_has_grown(monkeypatch):
+    """A survey of few photos does not lose time in pages that come and go."""
+    resident, asked = [400 << 20], []
+    monkeypatch.setattr(free_memory, "resident_bytes", lambda: resident[-1])
+
+    def give_back():
+        asked.append(resident[-1] >> 20)
+        resident.append(resident[-1] - (30 << 20))
+
+    monkeypatch.setattr(free_memory, "give_back", give_back)
+    monkeypatch.setattr(free_memory, "_least", [0])
+    for mb in (400, 460, 469, 471, 440, 300, 390, 405, 500):
+        resident.append(mb << 20)
+        free_memory.give_back_growth()
+    # after 400 there were 370, after 471 441, and 300 were the least since; then 375
+    assert asked == [400, 471, 405, 500]
 
 
 def test_a_process_does_not_tell_the_memory_of_the_one_that_started_it():

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from skyquilt.engine.free_memory import give_back
+from skyquilt.engine.free_memory import give_back_growth
 from skyquilt.engine.store import Store
 from skyquilt.engine.workers import HERE, Workers
 from skyquilt.model.event import Event, StageFinished, StageProgress, StageStarted
@@ -101,7 +101,7 @@ class Clock:
         finally:
             work.close()
         del work
-        give_back()
+        give_back_growth()
         self.lap(name, begun)
         yield StageFinished(
             stage=name,

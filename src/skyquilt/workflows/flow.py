@@ -19,7 +19,7 @@ from skyquilt.alignment.late_positions import as_moved
 from skyquilt.alignment.oblique_guess import lowered
 from skyquilt.alignment.priors import choose_frame, priors
 from skyquilt.engine.clock import Clock, Steps
-from skyquilt.engine.free_memory import give_back
+from skyquilt.engine.free_memory import give_back_growth
 from skyquilt.engine.pixel_cache import PixelCache, pixel_budget, resident_budget
 from skyquilt.engine.store import Store
 from skyquilt.engine.workers import Workers
@@ -325,7 +325,7 @@ def _drawn(
     """Draws the map, then the rasters beside it, for which decoded photos make room."""
     yield from drawing.blocks(workers)
     pixels.make_room()
-    give_back()
+    give_back_growth()
     return drawing.companions()
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.pose import ByPose
 from skyquilt.engine.clock import Steps
-from skyquilt.engine.free_memory import give_back
+from skyquilt.engine.free_memory import give_back_growth
 from skyquilt.engine.store import Store, digest
 from skyquilt.engine.workers import Workers
 from skyquilt.geometry.set_aside import InFile
@@ -395,4 +395,4 @@ def make_room(found: FeaturedPhotos, grey: GreyPictures, links: Links) -> None:
     found.looks.make_room()
     grey.make_room()
     links.make_room()
-    give_back()
+    give_back_growth()

@@ -22,7 +22,7 @@ from skyquilt.alignment.priors import stretch_warnings
 from skyquilt.engine.clock import Clock, Steps, result_of
 from skyquilt.engine.error_log import log_error
 from skyquilt.engine.folder import STATE, RunFolder, open_run
-from skyquilt.engine.free_memory import give_back, return_large_blocks
+from skyquilt.engine.free_memory import give_back_growth, return_large_blocks
 from skyquilt.engine.store import Store, digest
 from skyquilt.engine.workers import Threads, Workers, workers_for
 from skyquilt.errors import PhotoFailedError
@@ -286,7 +286,7 @@ def _made(given: SurveyInput, make: _Making) -> Generator[Event, None, dict[str,
     metrics = _metrics(aligned, ground, drawn, seams, tone, settings) | {"quality": quality}
     metrics |= added
     aligned.found.looks.make_room()
-    give_back()
+    give_back_growth()
     finishing = finish_run(
         output, aligned, ground, drawn.drawn, drawn.compose, seams, metrics, settings, clock
     )
