@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.enlarged import heights_above_ground
 from skyquilt.alignment.similarity_graph import fit_similarity
 from skyquilt.model.poses import Alignment, Prior
 
@@ -72,18 +73,10 @@ def enlargement_warnings(priors: Sequence[Prior], alignment: Alignment) -> list[
     """
     if alignment.frame.crs is None or not len(alignment.ties.xyz):
         return []
-    ground = float(np.median(alignment.ties.xyz[:, 2]))
-    told = {i: priors[i].map_C[2] for i in alignment.held if np.isfinite(priors[i].map_C[2])}
-    if not told:
-        return []
-    shift = float(np.median([alignment.poses[i].map_C[2] - z for i, z in told.items()]))
+    found, told = heights_above_ground(alignment, priors)
     out = list[str]()
     for key in dict.fromkeys(alignment.camera_of[i] for i in told):
-        pairs = [
-            (alignment.poses[i].map_C[2] - ground, z + shift - ground)
-            for i, z in told.items()
-            if alignment.camera_of[i] == key
-        ]
+        pairs = [(found[i], z) for i, z in told.items() if alignment.camera_of[i] == key]
         usual = float(np.median([r for _, r in pairs]))
         ratio = np.sort([h / r for h, r in pairs if h > 0 and abs(r - usual) < ALIKE * usual])
         near, gap = ratio[FEWEST_ENLARGED - 1 : 1 - FEWEST_ENLARGED], 0.0

@@ -32,6 +32,20 @@ NAMED = "enlarged"
 """In the name of a group's camera."""
 
 
+def heights_above_ground(
+    found: Alignment, priors: Sequence[Prior]
+) -> tuple[dict[int, float], dict[int, float]]:
+    """Heights in m of connected photos (index) above the median tie point: by the adjustment, and
+    as reported, of those that report theirs, less what these are off in the median. There must be
+    tie points.
+    """
+    ground = float(np.median(found.ties.xyz[:, 2]))
+    C = {i: found.poses[i].map_C[2] for i in found.held}
+    told = {i: priors[i].map_C[2] for i in found.held if np.isfinite(priors[i].map_C[2])}
+    shift = float(np.median([C[i] - z for i, z in told.items()] or [0.0]))
+    return {i: z - ground for i, z in C.items()}, {i: z + shift - ground for i, z in told.items()}
+
+
 def enlarged_photos(
     found: Alignment, cameras: Sequence[str], priors: Sequence[Prior]
 ) -> dict[int, float]:
@@ -41,16 +55,13 @@ def enlarged_photos(
     """
     if not len(found.ties.xyz):
         return {}
-    ground = float(np.median(found.ties.xyz[:, 2]))
-    height = {i: found.poses[i].map_C[2] - ground for i in found.held}
-    told = {i: priors[i].map_C[2] for i in height if np.isfinite(priors[i].map_C[2])}
-    shift = float(np.median([found.poses[i].map_C[2] - z for i, z in told.items()] or [0.0]))
+    height, told = heights_above_ground(found, priors)
     factors = dict[int, float]()
     for name in dict.fromkeys(cameras[i] for i in height):
         own = [i for i in height if cameras[i] == name and height[i] > 0]
         if 2 * len([i for i in own if i in told]) > len(own):
-            own = [i for i in own if i in told and told[i] + shift > ground]
-            ratio = np.array([height[i] / (told[i] + shift - ground) for i in own])
+            own = [i for i in own if told.get(i, 0.0) > 0]
+            ratio = np.array([height[i] / told[i] for i in own])
         else:
             ratio = np.array([height[i] for i in own])
         if len(own) < 2 * FEWEST or any(found.camera(i).fisheye for i in own):
