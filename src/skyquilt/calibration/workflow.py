@@ -17,7 +17,7 @@ from skyquilt.calibration.deviations import widened
 from skyquilt.calibration.few_views import FewViews, cannot_know
 from skyquilt.calibration.find_board import FindBoard
 from skyquilt.engine.clock import Clock, Steps
-from skyquilt.engine.folder import claimed
+from skyquilt.engine.folder import claimed, same_folder
 from skyquilt.engine.store import Store
 from skyquilt.engine.workers import Threads
 from skyquilt.errors import RefusedError, UsageError
@@ -91,7 +91,7 @@ def iter_calibrate(
         SkyquiltError: any other error that the user can correct.
     """
     frames, output, began = Path(frames), Path(output), Clock.now()
-    if frames.is_dir() and os.path.realpath(frames) == os.path.realpath(output):
+    if frames.is_dir() and same_folder(frames, output):
         raise UsageError(
             f"{output} contains the frames; choose another folder, such as {output / 'calibration'}"
         )

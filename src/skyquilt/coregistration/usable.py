@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.imaging.blank import rim_labels
 from skyquilt.model.registration import Picture, RefusedRegistration
 
 SHORTEST = 48
@@ -73,8 +74,8 @@ def _frame(grey: NDArray[np.float32], given: NDArray[np.bool_], slack: float) ->
         _count, label, stats, _ = cv2.connectedComponentsWithStats(
             end.astype(np.uint8), connectivity=4
         )
-        for region in np.unique(np.r_[label[0], label[-1], label[:, 0], label[:, -1]]):
-            if region and stats[region, cv2.CC_STAT_AREA] > LEAST_FRAME * grey.size:
+        for region in rim_labels(label):
+            if stats[region, cv2.CC_STAT_AREA] > LEAST_FRAME * grey.size:
                 frame |= label == region
     return frame
 

@@ -108,11 +108,16 @@ def blank_rim(pictures: Sequence[NDArray[np.uint8]]) -> Mask | None:
     return mask if np.median(steps) >= STEP else None
 
 
+def rim_labels(label: NDArray[Any]) -> NDArray[Any]:
+    """The labels (h, w) of connected parts that reach the rim of a picture; 0 is none."""
+    at_rim = np.unique(np.concatenate([label[0], label[-1], label[:, 0], label[:, -1]]))
+    return np.asarray(at_rim[at_rim > 0])
+
+
 def _rim(dark: Mask) -> Mask:
     """The parts of a mask (h, w) that reach the rim of the picture."""
     _, label = cv2.connectedComponents(dark.astype(np.uint8), connectivity=4)
-    rim = np.concatenate([label[0], label[-1], label[:, 0], label[:, -1]])
-    return np.asarray(dark & np.isin(label, rim[rim > 0]))
+    return np.asarray(np.isin(label, rim_labels(label)))
 
 
 def _room(mask: Mask) -> NDArray[np.float32]:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from skyquilt.engine.folder import same_folder
 from skyquilt.errors import UsageError
 from skyquilt.live.clip_intake import Taking, advanced, take_clip, unfinished_clip
 from skyquilt.live.closed_files import ClosedFiles
@@ -70,7 +71,7 @@ def apart(inbox: Path, output: Path) -> None:
     Raises:
         UsageError: it is.
     """
-    if os.path.realpath(inbox) == os.path.realpath(output):
+    if same_folder(inbox, output):
         raise UsageError(
             f"{output} is the folder of the photos, and the map that grows there would be taken for"
             f" one; choose another folder for the survey, such as {output / 'map'}"

@@ -1,11 +1,11 @@
 """Input of a run: metadata of photos, side files, control points, known distances."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from skyquilt.alignment.priors import choose_frame
+from skyquilt.engine.folder import same_folder
 from skyquilt.errors import PhotoFailedError, SkyquiltError, UsageError
 from skyquilt.model.clip import ChosenFrames
 from skyquilt.model.photo import (
@@ -190,11 +190,7 @@ def check_input(given: SurveyInput, output: Path, settings: MosaicSettings) -> N
         UsageError, SideFileError: they do not.
     """
     source = given.source
-    if (
-        isinstance(source, Path)
-        and source.is_dir()
-        and os.path.realpath(source) == os.path.realpath(output)
-    ):
+    if isinstance(source, Path) and source.is_dir() and same_folder(source, output):
         raise UsageError(
             f"{output} contains the photos; choose another folder for the results, such as"
             f" {output / 'map'}"
