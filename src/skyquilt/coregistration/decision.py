@@ -23,9 +23,13 @@ from skyquilt.coregistration.repeats import Repeats, Rival
 from skyquilt.coregistration.subpixel import Fit, Freedom, SubpixelRefinement
 from skyquilt.geometry.transforms import fit as fitted
 from skyquilt.geometry.transforms import transfer
-from skyquilt.model.registration import ErrorField, Matrix, RefusedRegistration, Registration
-
-Outcome = Registration | RefusedRegistration
+from skyquilt.model.registration import (
+    ErrorField,
+    Matrix,
+    Outcome,
+    RefusedRegistration,
+    Registration,
+)
 
 
 @dataclass(frozen=True, kw_only=True)

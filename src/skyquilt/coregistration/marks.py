@@ -15,9 +15,14 @@ from skyquilt.coregistration.agreement import Agree
 from skyquilt.coregistration.orientation import between, orientation
 from skyquilt.coregistration.usable import both_usable, one_band
 from skyquilt.geometry.transforms import transfer
-from skyquilt.model.registration import Guess, Picture, RefusedRegistration, Registers, Registration
-
-Outcome = Registration | RefusedRegistration
+from skyquilt.model.registration import (
+    Guess,
+    Outcome,
+    Picture,
+    RefusedRegistration,
+    Registers,
+    Registration,
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -154,7 +159,7 @@ class WithoutMarks:
         if (marks := self.find(a, b)) is None:
             return self.method(a, b, guess)
         clear_a, clear_b = marks.cleared(a), marks.cleared(b)
-        for hidden in (np.zeros_like(marks.certain), marks.certain, marks.possible):
+        for hidden in (None, marks.certain, marks.possible):
             found = self.method(_without(clear_a, hidden), _without(clear_b, hidden), guess)
             if isinstance(found, RefusedRegistration) or not self._of_marks(found, a, b):
                 return found
@@ -182,9 +187,9 @@ class WithoutMarks:
         return agreement.surprise >= self.least_surprise
 
 
-def _without(picture: Picture, marks: NDArray[np.uint8]) -> Picture:
-    """The picture without measurements at marks."""
-    if not marks.any():
+def _without(picture: Picture, marks: NDArray[np.uint8] | None) -> Picture:
+    """The picture without measurements at marks, if any are given."""
+    if marks is None:
         return picture
     free = _sized(marks, picture.shape) == 0
     return replace(picture, valid=free if picture.valid is None else free & picture.valid)

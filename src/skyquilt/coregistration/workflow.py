@@ -22,12 +22,11 @@ from skyquilt.engine.folder import claimed
 from skyquilt.errors import RefusedError
 from skyquilt.model.event import Event, Note, Result, StageFinished, StageStarted
 from skyquilt.model.photo import RejectedPhoto
-from skyquilt.model.registration import Guess, RefusedRegistration, Registration
+from skyquilt.model.registration import Guess, Outcome, RefusedRegistration, Registration
 from skyquilt.quality.registration_quality import spread_quality
 from skyquilt.raster.atomic import write_text
 from skyquilt.version import __version__
 
-Outcome = Registration | RefusedRegistration
 STAGES = ("read", "register", "draw")
 """Stages in order; a refusal has nothing to draw."""
 

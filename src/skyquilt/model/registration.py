@@ -142,11 +142,13 @@ class RefusedRegistration:
         return False
 
 
+Outcome = Registration | RefusedRegistration
+"""What a method gives."""
+
+
 class Registers(Protocol):
     """A method that registers two images."""
 
-    def __call__(
-        self, a: Picture, b: Picture, guess: Guess | None = None
-    ) -> Registration | RefusedRegistration:
+    def __call__(self, a: Picture, b: Picture, guess: Guess | None = None) -> Outcome:
         """Registers b to a, in px of the images, or returns why that failed."""
         ...

@@ -25,7 +25,14 @@ from skyquilt.matching.ransac import Ransac
 from skyquilt.matching.sift import Sift
 from skyquilt.model.estimate import Estimate, NoEstimate
 from skyquilt.model.features import Features, Matches
-from skyquilt.model.registration import Guess, Picture, RefusedRegistration, Registers, Registration
+from skyquilt.model.registration import (
+    Guess,
+    Outcome,
+    Picture,
+    RefusedRegistration,
+    Registers,
+    Registration,
+)
 from skyquilt.papers.lmeds import Lmeds
 from skyquilt.papers.surf import Surf
 from skyquilt.quality.registration_quality import spread_quality
@@ -77,7 +84,6 @@ def binary_edges(magnitude: NDArray[np.float32], theta: float) -> NDArray[np.uin
     return np.where(magnitude > theta, 255, 0).astype(np.uint8)
 
 
-Outcome = Registration | RefusedRegistration
 Detector = Callable[[NDArray[Any]], Features]
 Matcher = Callable[[Features, Features], Matches]
 Estimator = Callable[[NDArray[Any], NDArray[Any]], Estimate | NoEstimate]

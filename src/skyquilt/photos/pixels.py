@@ -185,8 +185,7 @@ def _png(file: BinaryIO, photo: Photo) -> Pixels:
             file.seek(0)
             pixels = np.asarray(png_decode(file.read()))
         else:
-            mode = "L" if photo.channels == 1 else "RGB"
-            mode = mode if not photo.alpha else "LA" if mode == "L" else "RGBA"
+            mode = ("L" if photo.channels == 1 else "RGB") + ("A" if photo.alpha else "")
             pixels = np.asarray(image.convert(mode))
     if photo.alpha:
         pixels = _emptied(pixels[..., :-1], pixels[..., -1])

@@ -14,7 +14,7 @@ from skyquilt.coregistration.refine_registration import RefineRegistration
 from skyquilt.coregistration.subpixel import SubpixelRefinement
 from skyquilt.errors import RefusedError
 from skyquilt.model.photo import Photo, RejectedPhoto
-from skyquilt.model.registration import Guess, Picture, RefusedRegistration, Registration
+from skyquilt.model.registration import Guess, Outcome, Picture, RefusedRegistration, Registration
 
 ROUTES = ("auto", "rig", "maps", "pairs", "heights", "positions", "homographies")
 """Registration methods: by the rig if one drone took both, by the images of both maps, by pairs of
@@ -27,7 +27,6 @@ FAR_M = 1000.0
 """If the nearest photos of two flights are further apart than this, in m, the flights show
 different places.
 """
-Outcome = Registration | RefusedRegistration
 _NO_PHOTOS = RefusedRegistration(reason="the photos of the maps are not available")
 
 
