@@ -186,6 +186,11 @@ def unzipped(archive: "ZipFile", name: str, most: int) -> bytes:
     return content
 
 
+def same_folder(a: Path, b: Path) -> bool:
+    """Whether two paths lead to one place. Unlike `Path.resolve`, links in a circle do no harm."""
+    return os.path.realpath(a) == os.path.realpath(b)
+
+
 def walk(
     top: Path, unread: Callable[[Path, OSError], None] | None = None
 ) -> Iterator[tuple[Path, list[str], list[str]]]:

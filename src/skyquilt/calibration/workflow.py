@@ -17,13 +17,14 @@ from skyquilt.calibration.deviations import widened
 from skyquilt.calibration.few_views import FewViews, cannot_know
 from skyquilt.calibration.find_board import FindBoard
 from skyquilt.engine.clock import Clock, Steps
-from skyquilt.engine.folder import claimed, same_folder
+from skyquilt.engine.folder import claimed
 from skyquilt.engine.store import Store
 from skyquilt.engine.workers import Threads
 from skyquilt.errors import RefusedError, UsageError
 from skyquilt.model.board import Board, RejectedView
 from skyquilt.model.calibration import Calibration
 from skyquilt.model.event import Event, Note, Result
+from skyquilt.outside import same_folder
 from skyquilt.photos.survey import read_survey
 
 FEWEST_VIEWS = 3

@@ -181,11 +181,6 @@ def claimed(path: Path, names: Sequence[str], *, overwrite: bool) -> Iterator[No
         lock.remove()
 
 
-def same_folder(a: Path, b: Path) -> bool:
-    """Whether two paths lead to one place. Unlike `Path.resolve`, links in a circle do no harm."""
-    return os.path.realpath(a) == os.path.realpath(b)
-
-
 def _refuse_file(path: Path) -> None:
     if os.path.lexists(path) and not path.is_dir():
         what = "a file" if path.exists() else "a link that leads nowhere"

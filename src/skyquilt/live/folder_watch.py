@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from skyquilt.engine.folder import same_folder
 from skyquilt.errors import UsageError
 from skyquilt.live.clip_intake import Taking, advanced, take_clip, unfinished_clip
 from skyquilt.live.closed_files import ClosedFiles
@@ -14,7 +13,7 @@ from skyquilt.live.inbox import ending_of, is_clip
 from skyquilt.live.ledger import hit
 from skyquilt.live.photo_intake import Accepted, Intake, Refused
 from skyquilt.model.photo import RejectedPhoto
-from skyquilt.outside import open_regular, walk
+from skyquilt.outside import open_regular, same_folder, walk
 from skyquilt.photos.read import read_photo
 from skyquilt.photos.survey import RUN_MARKS
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from skyquilt.alignment.priors import choose_frame
-from skyquilt.engine.folder import same_folder
 from skyquilt.errors import PhotoFailedError, SkyquiltError, UsageError
 from skyquilt.model.clip import ChosenFrames
 from skyquilt.model.photo import (
@@ -15,6 +14,7 @@ from skyquilt.model.photo import (
     RejectedPhoto,
     Survey,
 )
+from skyquilt.outside import same_folder
 from skyquilt.photos.distances import read_distances
 from skyquilt.photos.gcp import check_control, read_gcp_list
 from skyquilt.photos.left_out import of_one_band
