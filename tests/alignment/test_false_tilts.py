@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skyquilt.alignment import bundle
+from skyquilt.alignment import repairs
 from skyquilt.alignment.false_tilts import told_no_tilt
 from tests.alignment.test_bundle import Flown
 
@@ -25,7 +25,7 @@ def test_a_fixed_camera_that_claims_to_look_straight_down(seed, monkeypatch):
     flown.priors = [replace(p, pitch_deg=0.0, roll_deg=0.0) for p in flown.priors]
     found = flown.aligned()
     assert sum("tilts of the camera contradict" in n for n in found.notes) == 1
-    monkeypatch.setattr(bundle, "told_no_tilt", lambda found, priors: (priors, ""))
+    monkeypatch.setattr(repairs, "told_no_tilt", lambda found, priors: (priors, ""))
     believing = flown.aligned()
     flown.priors = [replace(p, sigma_tilt_deg=8.0) for p in flown.priors]
     untold = flown.aligned()

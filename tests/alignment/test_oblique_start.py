@@ -248,7 +248,7 @@ def test_a_guess_that_leaves_the_pictures_for_the_positions_is_not_taken(monkeyp
         return whole if len(begun) == 1 else replace(whole, poses=near, ties=ties)
 
     monkeypatch.setattr(Bundle, "_block", block)
-    monkeypatch.setattr("skyquilt.alignment.bundle.misled", lambda *given: True)
+    monkeypatch.setattr("skyquilt.alignment.repairs.misled", lambda *given: True)
     monkeypatch.setattr("skyquilt.alignment.bundle.guessed_priors", lambda *given: flown.priors)
     found = flown.aligned()
     assert len(begun) == 2

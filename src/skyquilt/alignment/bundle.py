@@ -9,25 +9,16 @@ import numpy as np
 from skyquilt.alignment.adjust import covariance
 from skyquilt.alignment.control import Control, hold_to_control, residuals_of_control
 from skyquilt.alignment.determined import weak_photos
-from skyquilt.alignment.displaced_parts import brought_together
 from skyquilt.alignment.dominant_plane import levelled
-from skyquilt.alignment.enlarged import as_enlarged, enlarged_note, enlarged_photos, fits_better
+from skyquilt.alignment.enlarged import as_enlarged
 from skyquilt.alignment.equations import NearFactor
-from skyquilt.alignment.false_tilts import told_no_tilt
-from skyquilt.alignment.late_positions import moved_note, unshifted
 from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
-from skyquilt.alignment.oblique import found_oblique, hung, reported_oblique, tilts_reported
-from skyquilt.alignment.oblique_guess import LOWERED, agrees, guessed_priors, lowered, misled
-from skyquilt.alignment.oblique_start import (
-    nearer,
-    off_positions,
-    reported_start,
-    slanting,
-    turned_priors,
-    untold,
-)
+from skyquilt.alignment.oblique import found_oblique, hung, tilts_reported
+from skyquilt.alignment.oblique_guess import LOWERED, guessed_priors, lowered
+from skyquilt.alignment.oblique_start import reported_start, slanting
 from skyquilt.alignment.outcome import accuracy, ground_points, leave_one_out, misfits, undetermined
 from skyquilt.alignment.problem import Problem, State
+from skyquilt.alignment.repairs import Beginning, Survey, begun_with, repaired
 from skyquilt.alignment.setup import Setup, camera_records, pose_records, set_up
 from skyquilt.alignment.stages import believe_positions, fine_steps, plain, rough_steps, weighed
 from skyquilt.alignment.start import Start, find_start, ground_of
@@ -44,14 +35,6 @@ from skyquilt.model.poses import Alignment, MapFrame, Prior, TiePoints
 
 ROUGHLY = 64
 """Observations per photo of the first stage, which only removes outliers and sets out."""
-ENLARGED_AGAIN = 3
-"""Photos that are enlarged by other factors are divided so often at most: what fits none of the
-cameras bends the heights by which the next are told.
-"""
-BEGUN_AGAIN = 5
-"""An oblique survey without camera angles is adjusted again as it was found, so often at most, as
-long as photos come nearer to their positions.
-"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,85 +85,45 @@ class Bundle:
         Raises:
             AlignmentError: no two photos are linked.
         """
-        aside = frozenset[int]()
-        if self.repair:
-            aside = untold(priors) if slanting(priors) else reported_oblique(priors)
 
-        def block(
-            aside: frozenset[int], priors: Sequence[Prior] = priors, name: str = ""
-        ) -> Alignment:
-            upright = [k for k in links if k.a not in aside and k.b not in aside]
+        def enlarged(begun: Beginning) -> Sequence[Photo]:
+            return as_enlarged(photos, begun.enlarged) if begun.enlarged else photos
+
+        def adjust(begun: Beginning) -> Alignment:
+            upright = [k for k in links if not begun.aside & {k.a, k.b}]
             part = (
-                keep.within(f"{name}{sorted(aside)}")
+                keep.within(f"{begun.name}{sorted(begun.aside)}")
                 if len(photos) > self.many
                 else Keep(workers=keep.workers)
             )
+            own = enlarged(begun)
             return self._block(
-                photos, frame, priors, features, upright, control, grey, part, make_room
+                own, frame, begun.told, features, upright, control, grey, part, make_room
             )
 
-        try:
-            found = block(aside)
-        except AlignmentError:
-            aside, found = frozenset(), block(frozenset())
-        said, name = list[str](), ""
-        cameras = [p.camera_key for p in photos]
-        taken, factors = photos, dict[int, float]()
-        for again in range(ENLARGED_AGAIN) if self.repair else ():
-            large = enlarged_photos(found, [p.camera_key for p in photos], priors)
-            if not large:
-                break
-            tried = factors | {i: factors.get(i, 1.0) * f for i, f in large.items()}
-            before, photos = photos, as_enlarged(taken, tried)
-            if not fits_better(other := block(aside, priors, f"big {again} "), found):
-                photos = before
-                break
-            found, factors, name = other, tried, f"big {again} "
-        if factors:
-            said.append(enlarged_note(factors, cameras))
-        moved = unshifted(found, priors, cameras) if self.repair else priors
-        if moved is not priors:
-            other = block(aside, moved, "moved ")
-            if off_positions(other, moved) < off_positions(found, priors):
-                said.append(moved_note(priors, moved))
-                found, priors, name = other, moved, "moved "
-        if level := self.repair and not slanting(priors):
-            loose, note = told_no_tilt(found, priors)
-            other = block(aside, loose, "loose ") if note else found
-            if note and off_positions(other, loose) < off_positions(found, priors):
-                said.append(note)
-                found, priors, name = other, loose, "loose "
-        linked = len({i for k in links for i in (k.a, k.b)})
-        guessed = False
-        if self.repair and misled(found, priors, linked):
-            guess = guessed_priors(photos, priors, features, links)
-            if guess is not None:
-                other = block(untold(guess), guess, "guessed ")
-                if nearer(other, found, priors) and agrees(other, found):
-                    found, aside, guessed = other, untold(guess), True
-        for again in range(BEGUN_AGAIN) if self.repair else ():
-            if (turned := turned_priors(found, priors)) is None:
-                break
-            other = block(untold(turned), turned, f"turned {again} ")
-            if not nearer(other, found, priors):
-                break
-            found, aside, guessed = other, untold(turned), True
-        level &= not guessed
-        together = brought_together(found, [p.name for p in photos], priors) if level else None
-        if together is not None:
-            other = block(aside, together.priors, "together ")
-            if off_positions(other, together.priors) < off_positions(found, priors):
-                said.append(together.note)
-                found, priors, name = other, together.priors, "together "
-        if lowered(found, priors) is not priors:
-            said.append(LOWERED)
-        weak = weak_photos(found, priors)
-        if self.repair and (more := found_oblique(found, weak, priors) - aside):
-            aside |= more
-            found = block(aside, priors, name)
-            weak = weak_photos(found, priors)
-        done = hung(found, weak, photos, priors, features, links, aside)
-        return replace(done, notes=(*done.notes, *said)) if said else done
+        def guess(begun: Beginning) -> Sequence[Prior] | None:
+            return guessed_priors(enlarged(begun), begun.priors, features, links)
+
+        survey = Survey(
+            names=[p.name for p in photos],
+            cameras=[p.camera_key for p in photos],
+            linked=len({i for k in links for i in (k.a, k.b)}),
+            adjust=adjust,
+            guess=guess,
+        )
+        tried = begun_with(priors, survey, repair=self.repair)
+        tried = repaired(tried, survey) if self.repair else tried
+        found, begun, notes = tried.found, tried.begun, tried.notes
+        if lowered(found, begun.priors) is not begun.priors:
+            notes += (LOWERED,)
+        weak = weak_photos(found, begun.priors)
+        if self.repair and (more := found_oblique(found, weak, begun.priors) - begun.aside):
+            begun = replace(begun, aside=begun.aside | more)
+            found = adjust(begun)
+            weak = weak_photos(found, begun.priors)
+        own = enlarged(begun)
+        done = hung(found, weak, own, begun.priors, features, links, begun.aside)
+        return replace(done, notes=(*done.notes, *notes)) if notes else done
 
     def _in_space(self, priors: Sequence[Prior]) -> bool:
         """Whether the start takes what photos report for their poses."""

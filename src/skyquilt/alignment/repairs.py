@@ -1,0 +1,199 @@
+"""Adjustments that are made again because the one before shows that files tell a part falsely.
+
+Each repair judges what files tell by an adjustment, adjusts again with what it thinks right, and
+takes that only where it fits better. They follow one another in the order of `REPAIRS`.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from skyquilt.alignment.displaced_parts import brought_together
+from skyquilt.alignment.enlarged import enlarged_note, enlarged_photos, fits_better
+from skyquilt.alignment.false_tilts import told_no_tilt
+from skyquilt.alignment.late_positions import moved_note, unshifted
+from skyquilt.alignment.oblique import reported_oblique
+from skyquilt.alignment.oblique_guess import agrees, misled
+from skyquilt.alignment.oblique_start import nearer, off_positions, slanting, turned_priors, untold
+from skyquilt.errors import AlignmentError
+from skyquilt.model.poses import Alignment, Prior
+
+ENLARGED_AGAIN = 3
+"""Photos that are enlarged by other factors are divided so often at most: what fits none of the
+cameras bends the heights by which the next are told.
+"""
+BEGUN_AGAIN = 5
+"""An oblique survey without camera angles is adjusted again as it was found, so often at most, as
+long as photos come nearer to their positions.
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Beginning:
+    """What an adjustment is begun with."""
+
+    priors: Sequence[Prior]
+    """What files tell of the photos, as far as it is believed."""
+    guess: Sequence[Prior] | None = None
+    """The same with guessed directions of the cameras."""
+    aside: frozenset[int] = frozenset()
+    """Photos that are not adjusted, but hung on the others afterwards."""
+    enlarged: Mapping[int, float] = field(default_factory=dict)
+    """Factors of photos that are enlarged against others of their camera."""
+    name: str = ""
+    """Tells parts of this adjustment that are kept from those of others."""
+
+    @property
+    def told(self) -> Sequence[Prior]:
+        """The priors of the adjustment."""
+        return self.priors if self.guess is None else self.guess
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tried:
+    """An adjustment and its beginning."""
+
+    found: Alignment
+    begun: Beginning
+    notes: tuple[str, ...] = ()
+    """What is said of the repairs that it has."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Survey:
+    """What repairs know of the survey, and may ask."""
+
+    names: Sequence[str]
+    """File names of the photos, in order of capture."""
+    cameras: Sequence[str]
+    """Names of their cameras."""
+    linked: int
+    """How many photos have links."""
+    adjust: Callable[[Beginning], Alignment]
+    """Adjusts the survey."""
+    guess: Callable[[Beginning], Sequence[Prior] | None]
+    """Priors with directions with which matched rays meet clearly better; None without any."""
+
+    def tried(self, begun: Beginning, **changes: Any) -> Tried:
+        """The adjustment begun so, with changes."""
+        changed = replace(begun, **changes)
+        return Tried(found=self.adjust(changed), begun=changed)
+
+
+def begun_with(priors: Sequence[Prior], survey: Survey, *, repair: bool) -> Tried:
+    """The first adjustment, with what files tell; oblique photos are kept aside for `repair`.
+
+    Raises:
+        AlignmentError: no two photos are linked.
+    """
+    aside = frozenset[int]()
+    if repair:
+        aside = untold(priors) if slanting(priors) else reported_oblique(priors)
+    try:
+        return survey.tried(Beginning(priors=priors, aside=aside))
+    except AlignmentError:
+        if not aside:
+            raise
+        return survey.tried(Beginning(priors=priors))
+
+
+def repaired(first: Tried, survey: Survey) -> Tried:
+    """The adjustment with all repairs that fit better than what was there before."""
+    for repair in REPAIRS:
+        first = repair(first, survey)
+    return first
+
+
+def _enlargements(last: Tried, survey: Survey) -> Tried:
+    """Photos that are enlarged without a word are calibrated by themselves."""
+    best = last
+    for again in range(ENLARGED_AGAIN):
+        factors = best.begun.enlarged
+        cameras = [f"{c} {factors.get(i, 1.0)}" for i, c in enumerate(survey.cameras)]
+        large = enlarged_photos(best.found, cameras, best.begun.priors)
+        if not large:
+            break
+        factors = {**factors, **{i: factors.get(i, 1.0) * f for i, f in large.items()}}
+        other = survey.tried(best.begun, enlarged=factors, name=f"big {again} ")
+        if not fits_better(other.found, best.found):
+            break
+        best = other
+    if best is last:
+        return last
+    return replace(best, notes=(*last.notes, enlarged_note(best.begun.enlarged, survey.cameras)))
+
+
+def _late_positions(last: Tried, survey: Survey) -> Tried:
+    """Positions that belong to other photos are moved to these."""
+    priors = last.begun.priors
+    moved = unshifted(last.found, priors, survey.cameras)
+    if moved is priors:
+        return last
+    return _if_nearer(last, survey, moved, "moved ", moved_note(priors, moved))
+
+
+def _false_tilts(last: Tried, survey: Survey) -> Tried:
+    """Tilts that pictures contradict as a whole are not used."""
+    if slanting(last.begun.priors):
+        return last
+    loose, note = told_no_tilt(last.found, last.begun.priors)
+    return _if_nearer(last, survey, loose, "loose ", note) if note else last
+
+
+def _guessed_directions(last: Tried, survey: Survey) -> Tried:
+    """Directions of oblique photos that files do not tell, or tell falsely, are guessed."""
+    priors = last.begun.priors
+    if not misled(last.found, priors, survey.linked):
+        return last
+    guess = survey.guess(last.begun)
+    if guess is None:
+        return last
+    other = survey.tried(last.begun, guess=guess, aside=untold(guess), name="guessed ")
+    if nearer(other.found, last.found, priors) and agrees(other.found, last.found):
+        return replace(other, notes=last.notes)
+    return last
+
+
+def _found_directions(last: Tried, survey: Survey) -> Tried:
+    """Oblique photos are begun again with the directions in which they were found."""
+    best, priors = last, last.begun.priors
+    for again in range(BEGUN_AGAIN):
+        turned = turned_priors(best.found, priors)
+        if turned is None:
+            break
+        name = f"turned {again} "
+        other = survey.tried(best.begun, guess=turned, aside=untold(turned), name=name)
+        if not nearer(other.found, best.found, priors):
+            break
+        best = other
+    return best if best is last else replace(best, notes=last.notes)
+
+
+def _displaced_parts(last: Tried, survey: Survey) -> Tried:
+    """Parts of the survey whose positions are displaced are brought together."""
+    priors = last.begun.priors
+    if slanting(priors) or last.begun.guess is not None:
+        return last
+    together = brought_together(last.found, survey.names, priors)
+    if together is None:
+        return last
+    return _if_nearer(last, survey, together.priors, "together ", together.note)
+
+
+def _if_nearer(last: Tried, survey: Survey, priors: Sequence[Prior], name: str, note: str) -> Tried:
+    """The adjustment with other priors, where photos come nearer to their positions with these."""
+    other = survey.tried(last.begun, priors=priors, name=name)
+    if off_positions(other.found, priors) < off_positions(last.found, priors):
+        return replace(other, notes=(*last.notes, note))
+    return last
+
+
+REPAIRS: tuple[Callable[[Tried, Survey], Tried], ...] = (
+    _enlargements,
+    _late_positions,
+    _false_tilts,
+    _guessed_directions,
+    _found_directions,
+    _displaced_parts,
+)
+"""All repairs, in order: each relies on those before."""
