@@ -7,7 +7,12 @@ from hypothesis import strategies as st
 
 from skyquilt.alignment import equations
 from skyquilt.alignment.adjust import adjust
-from skyquilt.alignment.eliminated_points import points_inverse, points_step, polish_points
+from skyquilt.alignment.eliminated_points import (
+    numbered,
+    points_inverse,
+    points_step,
+    polish_points,
+)
 from skyquilt.alignment.equations import Equations, NearFactor
 from skyquilt.alignment.problem import CAMERA, linearise
 from skyquilt.alignment.robust import observation_weights, prior_terms, robust_cost
@@ -27,6 +32,23 @@ def test_the_inverse_of_each_factor(seed, damping):
     expected = np.linalg.inv(np.linalg.cholesky(asked))
     scale = np.abs(expected).max((1, 2), keepdims=True)
     assert (np.abs(points_inverse(blocks, damping) - expected) < 1e-7 * scale).all()
+
+
+@given(st.lists(st.integers(0, 19)))
+def test_places_among_the_different_ones_are_numpys(values):
+    given = np.array(values, np.int64)
+    for found, right in zip(
+        numbered(given, 20), np.unique(given, return_inverse=True), strict=True
+    ):
+        assert found.tolist() == right.tolist()
+
+
+def test_pairs_that_share_a_point_are_found(monkeypatch):
+    monkeypatch.setattr(equations, "LEAF", 0)
+    problem = make_block(3, points=60).problem
+    found = set(zip(*(side.tolist() for side in equations._together(problem)), strict=True))
+    shown = [set(problem.photo[problem.point == k].tolist()) for k in range(60)]
+    assert found == {(a, b) for s in shown for a in s for b in s if a < b} and len(found) > 50
 
 
 def test_a_point_that_is_not_determined():

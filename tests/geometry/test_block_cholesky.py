@@ -9,7 +9,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from skyquilt.geometry import block_cholesky
-from skyquilt.geometry.block_cholesky import Factor, Matrix, pattern
+from skyquilt.geometry.block_cholesky import Factor, Matrix, distinct, pattern
 from skyquilt.geometry.set_aside import SetAside
 from tests.alignment.blocks import dense_matrix
 
@@ -99,6 +99,12 @@ def test_any_graph_is_factored(count, ends, border, seed):
         check(matrix(places, pairs, border=border, seed=seed), rel=1e-7)
     finally:
         block_cholesky.LEAF = before
+
+
+@given(st.lists(st.integers(0, 40)))
+def test_different_numbers_are_numpys(numbers):
+    values = np.array(numbers, np.int64)
+    assert distinct(values).tolist() == np.unique(values).tolist()
 
 
 def test_what_is_not_positive_definite_is_refused():

@@ -73,6 +73,15 @@ class Reduced:
     """(p s + q m,) gradient."""
 
 
+def numbered(values: Index, count: int) -> tuple[Index, Index]:
+    """The different ones of some numbers (n,) below `count`, ascending, and the place of each among
+    them, as `numpy.unique` gives them, but without sorting.
+    """
+    there = np.zeros(count, np.bool_)
+    there[values] = True
+    return np.flatnonzero(there), (np.cumsum(there) - 1)[values]
+
+
 def sums_by_point(problem: Problem, values: Array, count: int) -> Array:
     """Sums of values (N, ...) of each point's observations: (count, ...). Observations are sorted
     by point.
@@ -111,7 +120,7 @@ def observation_equations(problem: Problem, state: State) -> Normal:
     rows = np.concatenate([lin.J_photo, lin.J_camera, lin.residual[..., None]], 2) * root
     m, count, q = len(state.K), len(state.X), lin.J_camera.shape[2]
     k = problem.photo_unknowns
-    seen, row = np.unique(problem.photo, return_inverse=True)
+    seen, row = numbered(problem.photo, len(problem.camera))
     by_photo = _by_photo(row, len(seen), rows)
     by_camera = np.zeros((m, q, q + 1))
     np.add.at(by_camera, problem.camera[seen], by_photo[:, k : k + q, k:])
@@ -230,8 +239,8 @@ def reduced_part(part: Problem, state: State, damping: float) -> Reduced:
     for lo, hi in pairwise(part.cuts(ELIMINATED)):
         point, row = part.point[lo:hi], normal.row[lo:hi]
         first, last = int(point[0]), int(point[-1]) + 1
-        some, local = np.unique(row, return_inverse=True)
-        cams, cam_of = np.unique(camera[some], return_inverse=True)
+        some, local = numbered(row, s)
+        cams, cam_of = numbered(camera[some], m)
         T = np.swapaxes(L_inv[point], 1, 2)
         n, c = len(some), len(cams) if q else 0
         rows = np.zeros((p * n + q * c, last - first, 3))

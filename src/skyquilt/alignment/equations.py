@@ -17,7 +17,7 @@ from skyquilt.alignment.problem import CAMERA, Problem, State
 from skyquilt.alignment.robust import position_terms, prior_terms
 from skyquilt.engine.free_memory import give_back
 from skyquilt.engine.workers import HERE, Workers
-from skyquilt.geometry.block_cholesky import LEAF, Factor, Index, Matrix, pattern
+from skyquilt.geometry.block_cholesky import LEAF, Factor, Index, Matrix, distinct, pattern
 from skyquilt.geometry.conjugate_gradients import conjugate_gradients
 
 Array = NDArray[np.float64]
@@ -44,9 +44,9 @@ def _together(problem: Problem) -> tuple[Index, Index]:
         alive = alive[alive + step < len(problem.point)]
         alive = alive[problem.point[alive] == problem.point[alive + step]]
         if not len(alive):
-            return keys // n, keys % n
+            return np.divmod(keys, n)
         ends = np.sort([problem.photo[alive], problem.photo[alive + step]], axis=0)
-        keys = np.union1d(keys, ends[0].astype(np.int64) * n + ends[1])
+        keys = distinct(np.concatenate([keys, ends[0].astype(np.int64) * n + ends[1]]))
         step += 1
 
 
