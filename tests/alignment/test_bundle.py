@@ -172,7 +172,9 @@ class StoppedError(Exception):
     pass
 
 
-@pytest.mark.parametrize("factored", [600, 5])  # photos up to which each step has its factor
+@pytest.mark.parametrize(
+    "factored", [pytest.param(600, marks=pytest.mark.slow), 5]
+)  # photos up to which each step has its factor
 def test_an_interrupted_adjustment_of_many_photos_goes_on_at_its_iteration(
     plain, monkeypatch, factored
 ):

@@ -28,8 +28,10 @@ def without_heights(flown):
     ]
 
 
-@pytest.mark.parametrize("told", [True, False])
-@pytest.mark.parametrize("factors", [(1.0, 1.4), (1.0, 1.3, 1.7)])
+@pytest.mark.parametrize("told", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "factors", [(1.0, 1.4), pytest.param((1.0, 1.3, 1.7), marks=pytest.mark.slow)]
+)
 def test_photos_that_are_enlarged_are_calibrated_by_themselves(told, factors):
     flown = Flown(1, lines=4, per_line=6, points=900, gps=0.5)
     each = np.resize(factors, len(flown.photos))

@@ -174,7 +174,7 @@ def test_an_orbit_begun_as_if_it_looked_down_is_begun_again(monkeypatch):
     assert np.median(turned) < 2.5
 
 
-@pytest.mark.parametrize("turn", [90, 180])
+@pytest.mark.parametrize("turn", [90, pytest.param(180, marks=pytest.mark.slow)])
 def test_headings_that_are_all_false_by_one_angle_are_corrected(turn):
     flown = Slanting(orbit(20, 50), seed=turn)
     flown.priors = [replace(p, yaw_deg=p.yaw_deg + turn) for p in flown.priors]

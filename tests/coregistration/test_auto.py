@@ -31,6 +31,7 @@ def test_any_rotation_is_found_to_a_part_of_a_pixel(auto, scale, degrees):
     )  # an error of exactly 0 would mean the truth had leaked
 
 
+@pytest.mark.slow
 def test_the_search_alone_finds_it_too(auto):
     blind = replace(
         auto.method, propose=StructureMatches(estimate=lambda a, b: NoEstimate(reason="not asked"))
@@ -204,7 +205,7 @@ def test_what_repeats_is_refused_and_found_where_trees_stand_off_their_rows(auto
     assert error(outcome[3.0].b_H_a, truth) < 1
 
 
-@pytest.mark.parametrize("degrees", [0.0, 25.0])
+@pytest.mark.parametrize("degrees", [pytest.param(0.0, marks=pytest.mark.slow), 25.0])
 def test_rows_of_crops_tell_no_place_along_them(auto, degrees):
     y, x = np.mgrid[:480, :640]
     across = x * np.cos(np.radians(degrees)) + y * np.sin(np.radians(degrees))

@@ -38,8 +38,8 @@ def moved(photo, folder, place):
     return copy
 
 
-@pytest.mark.parametrize("place", [SYDNEY, NEXT_ZONE])
-@pytest.mark.parametrize("strangers", [1, 2])
+@pytest.mark.parametrize("place", [SYDNEY, pytest.param(NEXT_ZONE, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("strangers", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_map_that_began_elsewhere_is_begun_again_where_most_photos_are(
     flight, tmp_path, place, strangers
 ):
@@ -58,6 +58,7 @@ def test_a_map_that_began_elsewhere_is_begun_again_where_most_photos_are(
     live.close()
 
 
+@pytest.mark.slow
 def test_a_later_photo_of_another_place_says_so_and_is_placed_by_its_links_alone(flight, tmp_path):
     overlapping = moved(flight.photos[2], tmp_path / "moved", SYDNEY)
     foreign = tmp_path / "foreign.jpg"

@@ -94,6 +94,7 @@ def test_a_box_stands_up(flight):
     assert 0.0 < np.median(np.abs(z[outside < -1] - BOX))  # found, not given
 
 
+@pytest.mark.slow
 def test_threads_and_parts_do_not_change_the_heights(flight, monkeypatch):
     """Three threads and tiles of 64 cells: the same heights; a kept part is not matched again."""
     views, grey = flight

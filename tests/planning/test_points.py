@@ -139,6 +139,7 @@ def test_what_would_need_too_many_photos_is_refused():
         place_points(make_site(area, (closed,), ZONE), VIEW, PlanSettings(height_m=300), FLAT)
 
 
+@pytest.mark.slow
 def test_thousands_of_photos_of_one_place_cost_little():
     """They share what they see, and the more photos there are the larger the cells become."""
     area = translate(box(0, 0, 400, 300), EAST, NORTH)

@@ -116,6 +116,7 @@ def test_footprints_are_those_of_the_run(finished, exported):
     assert box[0] <= b.left + 1 and box[2] >= b.right - 1 and box[3] > box[1]
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_part(finished, tmp_path, monkeypatch):
     """The rows written at a time are bounded, and the result is the same."""
     from skyquilt.runs import grid

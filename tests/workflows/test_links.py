@@ -54,6 +54,7 @@ def test_numbers_take_the_room_they_need(largest, kind):
     assert numbers(np.zeros(0, np.int64)).dtype == np.uint16
 
 
+@pytest.mark.slow
 def test_a_run_that_goes_on_takes_all_links_at_once(flight, tmp_path, monkeypatch):
     quick = MosaicSettings(surface="ties", gsd_cm=30.0, jobs=1, features=1500)
     first = mosaic(flight / "photos", tmp_path / "out", quick).metrics
@@ -71,6 +72,7 @@ def test_a_run_that_goes_on_takes_all_links_at_once(flight, tmp_path, monkeypatc
     assert asked
 
 
+@pytest.mark.slow
 def test_matches_in_files_give_the_same_map(flight, tmp_path, monkeypatch):
     quick = MosaicSettings(surface="ties", gsd_cm=30.0, jobs=1, features=1500)
     mosaic(flight / "photos", tmp_path / "memory", quick)

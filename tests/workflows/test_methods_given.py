@@ -37,12 +37,8 @@ def placed(flight, tmp_path, **asked):
     return result
 
 
-SLOW = pytest.mark.slow
-
-
-@pytest.mark.parametrize(
-    "detector", ["orb", *(pytest.param(d, marks=SLOW) for d in ("sift", "surf", "akaze"))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("detector", ["orb", "sift", "surf", "akaze"])
 def test_bundle_by_every_detector_that_turns_with_the_photos(flight, tmp_path, detector):
     made = placed(flight, tmp_path, detector=detector, features=1500)
     assert made.metrics["blocks"] == [9]
