@@ -2,13 +2,17 @@
 
 import re
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import rasterio
 
 import skyquilt
+from skyquilt.engine.store import Store
 from skyquilt.errors import UsageError
+from skyquilt.workflows.artefacts import REGISTRY
+from skyquilt.workflows.finished import NAME, STAGE
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +82,22 @@ def test_without_its_store_a_run_says_what_is_missing(finished, tmp_path):
         _ = opened.observations
     with pytest.raises(UsageError, match="no finished run"):
         skyquilt.open_run(tmp_path / "nowhere")
+
+
+def test_observations_are_those_of_the_map_whatever_the_clock_says(finished, tmp_path):
+    """A clock set back between two runs makes an older alignment the newer file."""
+    folder = shutil.copytree(finished.output, tmp_path / "run")
+    store = Store(folder=folder / ".skyquilt" / "store", registry=REGISTRY)
+    made = store.get(STAGE, NAME)
+    own = store.get("alignment", made.alignment)
+    poses = {i: replace(p, map_C=p.map_C + 7.0) for i, p in own.poses.items()}
+    other = replace(own, poses=poses, ties=replace(own.ties, xyz=own.ties.xyz + 7.0))
+    store.put("alignment", "f" * 32, other)
+    expected = skyquilt.open_run(finished.output).observations
+    assert np.array_equal(skyquilt.open_run(folder).observations.points, expected.points)
+    store.put(STAGE, NAME, replace(made, alignment="f" * 32))
+    with pytest.raises(UsageError, match="not those of the map"):
+        _ = skyquilt.open_run(folder).observations
 
 
 def test_what_notebooks_show_is_short_and_holds_a_map(run, finished, flight):

@@ -18,6 +18,7 @@ import numpy as np
 
 from skyquilt.engine.error_log import NAME as ERRORS
 from skyquilt.engine.error_log import log_error
+from skyquilt.engine.folder import make_folder
 from skyquilt.engine.free_memory import give_back
 from skyquilt.engine.lock import FolderLock
 from skyquilt.engine.pixel_cache import PixelCache
@@ -81,10 +82,7 @@ class LiveMap:
         """
         cv2.setNumThreads(1)
         self.folder, self.settings = Path(folder), settings or LiveSettings()
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
+        make_folder(self.folder)
         self.lock = FolderLock(self.folder, LOCK, "live map")
         self.ledger = Ledger(self.folder, write=True)
         self._same_settings()

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.errors import UsageError
-from skyquilt.raster.drivers import GEOTIFF
 from skyquilt.raster.map_source import Bounds, FileSource
 
 if TYPE_CHECKING:
@@ -49,12 +48,12 @@ def read_raster(
 
     Raises:
         UsageError: the part has no area, or lies outside.
+        SideFileError: the file is damaged.
     """
-    import rasterio
     from rasterio.enums import Resampling
     from rasterio.windows import Window
 
-    with rasterio.open(source.path, driver=GEOTIFF) as file:
+    with source.opened() as file:
         own, left, top = file.res[0], file.bounds.left, file.bounds.top
         west, south, east, north = bounds or tuple(file.bounds)
         c0, c1 = (int(np.clip(round((v - left) / own), 0, file.width)) for v in (west, east))

@@ -190,6 +190,12 @@ def make_map(
         yield Note(text=f"{run.path} already contains this mosaic; nothing to do")
         result = Result(output=run.path, metrics=former)
         return FinishedMap(result=result, given=given, methods=methods, settings=settings)
+    if changed := run.changed:
+        yield Note(
+            text=f"{', '.join(changed)} in {run.path} are not as the run wrote them, and are made"
+            " again",
+            warning=True,
+        )
     run.mark("running")
     if files is not None:
         files.keep(store)
