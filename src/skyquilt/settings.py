@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from skyquilt import registry
+from skyquilt.effects import MOSAIC, refuse_idle, refuse_untaken
 from skyquilt.errors import UsageError
 from skyquilt.outside import MOST_MP
 
@@ -359,22 +360,8 @@ GROUPS: dict[str, type] = {
 """Groups by the name of their field."""
 GROUP_OF = {f.name: name for name, kind in GROUPS.items() for f in fields(kind)}
 """Name of a setting -> the group it belongs to."""
-_ASKED = {
-    "detector": ("detector", None),
-    "matcher": ("matcher", None),
-    "estimator": ("estimator", None),
-    "transform": ("transform", None),
-    "relief": ("relief_m", None),
-    "levelled": ("levelled", True),
-    "image-search": ("image_search", "chain"),
-    "optimiser": ("optimiser", "surfaces"),
-    "lines": ("lines", "heading"),
-    "heading": ("heading_deg", None),
-    "vertical-datum": ("vertical_datum", None),
-}
-"""Options of some methods only: the setting, and its value if the option is not given."""
-OPTION_OF = {setting: option for option, (setting, _) in _ASKED.items()}
-"""Setting -> option (without `--`), of those."""
+DEFAULTS = {f.name: f.default for kind in GROUPS.values() for f in fields(kind)}
+"""Name of a setting -> its value if it is not given."""
 
 
 @dataclass(frozen=True, kw_only=True, init=False)
@@ -421,7 +408,9 @@ class MosaicSettings:
             changes = {f.name: getattr(given, f.name) for f in fields(kind)}
             changes |= {k: v for k, v in options.items() if GROUP_OF.get(k) == name}
             object.__setattr__(self, name, kind(**changes))
-        _check_taken(self)
+        asked = {name for name, value in self if value != DEFAULTS.get(name, value)}
+        refuse_untaken(dict(self), asked)
+        refuse_idle(MOSAIC, dict(self), asked)
 
     def changed(self, **options: Any) -> "MosaicSettings":
         """The same with other values of these settings, by their own names, or of the method."""
@@ -437,34 +426,3 @@ class MosaicSettings:
     def as_table(self) -> dict[str, Any]:
         """Names and values as written to run.toml; unset ones left out."""
         return {k: str(v) if isinstance(v, Path) else v for k, v in self if v is not None}
-
-
-def _check_taken(settings: MosaicSettings) -> None:
-    """Refuses what the method does not take: an option without effect would mislead."""
-    takes, values = registry.row("alignment", settings.method).takes, dict(settings)
-    for option, (setting, unasked) in _ASKED.items():
-        value = values[setting]
-        if value == unasked:
-            continue
-        if option not in takes:
-            others = [n for n in registry.names("alignment") if _takes(n, option)]
-            raise UsageError(
-                f"--{option} is for --method {' or '.join(others)}; the method here is"
-                f" {settings.method}"
-            )
-        if takes[option] and value not in takes[option]:
-            raise UsageError(
-                f"--method {settings.method} takes --{option} {', '.join(takes[option])},"
-                f" not {value}"
-            )
-    if not settings.input.repair and settings.method in ("position", "pose", "hybrid"):
-        asked = [o for o in ("detector", "matcher", "estimator") if values[o] is not None]
-        if asked:
-            raise UsageError(
-                f"--{asked[0]} would have no effect: with --trust-metadata, method"
-                f" {settings.method} compares no photos"
-            )
-
-
-def _takes(method: str, option: str) -> bool:
-    return option in registry.row("alignment", method).takes

@@ -120,7 +120,7 @@ class Run:
         store = Store(folder=self.path / STATE / "store", registry=REGISTRY)
         made = store.get(STAGE, NAME)
         found = None if made is None else store.get("alignment", made.alignment)
-        if found is None:
+        if made is None or found is None:
             raise UsageError(
                 f"{self.path} has no observations: they are in its folder {STATE}, which has been"
                 " deleted; make the map again"

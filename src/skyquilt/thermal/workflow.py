@@ -32,7 +32,7 @@ from skyquilt.model.photo import Survey
 from skyquilt.model.registration import RefusedRegistration, Registration
 from skyquilt.ortho.radiometry import recorded_tags, value_figures
 from skyquilt.photos.together import taken_together
-from skyquilt.settings import MosaicSettings, PictureSettings
+from skyquilt.settings import DEFAULTS, MosaicSettings, PictureSettings
 from skyquilt.thermal.by_heights import finer
 from skyquilt.thermal.by_pairs import by_homographies, by_pairs
 from skyquilt.thermal.by_rig import draw_rigged, drift_of_rigged, rig_figures, rigged
@@ -124,19 +124,16 @@ def _settings_of_both(asked: MosaicSettings) -> tuple[MosaicSettings, MosaicSett
     only.
     """
     named = asked.input.sequence in ("time", "name")
-    heated = asked.changed(
-        thermal_unit=asked.input.thermal_unit or "auto",
-        gcp=None,
-        geo=None,
-        cameras=None,
-        distances=None,
-        sequence=asked.input.sequence if named else "time",
-        bounds=None,
-        boundary=None,
-        gsd_cm=None,
-        compress="auto",
+    own = (
+        *("gcp", "geo", "cameras", "distances", "bounds", "boundary", "gsd_cm", "compress"),
+        *("quality", "frame_overlap", "clock_offset", "write_frames"),
     )
-    return asked.changed(thermal_unit=None), heated
+    heated = asked.changed(
+        **{name: DEFAULTS[name] for name in own},
+        thermal_unit=asked.input.thermal_unit or "auto",
+        sequence=asked.input.sequence if named else "time",
+    )
+    return asked.changed(thermal_unit=None, balance_thermal=None), heated
 
 
 def _joined(

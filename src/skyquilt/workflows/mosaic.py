@@ -178,7 +178,7 @@ def make_map(
     """
     return_large_blocks()
     began, methods = began or Clock.now(), methods or methods_for(settings)
-    check_input(given, output, settings)
+    given = check_input(given, output, settings)
     key, recipe = run_key(given, settings, methods), recipe_of(given, settings, methods)
     earlier = _earlier(given, output, recipe) if add else None
     again = rerun_from is not None
