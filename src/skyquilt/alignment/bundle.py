@@ -113,7 +113,7 @@ class Bundle:
             part = (
                 keep.within(f"{name}{sorted(aside)}")
                 if len(photos) > self.many
-                else Keep(workers=keep.workers)
+                else Keep(workers=keep.workers, told=keep.told)
             )
             return self._block(
                 photos, frame, priors, features, upright, control, grey, part, make_room
@@ -281,6 +281,7 @@ class Bundle:
         del step, near
         problem, state, frame, reports = hold_to_control(problem, state, frame, setup, control)
         make_room()
+        keep.tell("outcome")
         ties = ground_points(aside.get(), setup, state)
         make_room()
         done = _outcome(
