@@ -14,6 +14,8 @@ from skyquilt.errors import UsageError
 Values = Mapping[str, Any]
 BY_PIXELS = ("ncc", "phase", "ecc", "mi")
 """Estimators that register pixels; the others estimate from matches of features."""
+FLIGHTLINE_FEATURES = 4000
+"""Least number of features for which the thresholds of method `flightline` are defined."""
 OPTION_OF = {
     "detector": "detector",
     "matcher": "matcher",
@@ -134,6 +136,11 @@ def _sure(values: Values) -> str:
     return _pixels(values)
 
 
+def _few(values: Values) -> str:
+    few = values["method"] == "flightline" and values["features"] < FLIGHTLINE_FEATURES
+    return f"method flightline takes at least {FLIGHTLINE_FEATURES}" if few else ""
+
+
 def _high(values: Values) -> str:
     if values["method"] == "bundle" and values["matcher"] != "guided":
         return "method bundle finds heights; only --matcher guided asks for one"
@@ -152,6 +159,7 @@ MOSAIC = (
     Rule(settings=("detector", "matcher", "features", "levelled", "relief_m"), idle=_pixels),
     Rule(settings=("relief_m",), idle=_unlevelled),
     Rule(settings=("seed",), idle=_sure),
+    Rule(settings=("features",), idle=_few),
     Rule(settings=("height_m",), idle=_high),
     Rule(settings=("jobs",), idle=_shared_out),
 )

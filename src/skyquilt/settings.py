@@ -14,6 +14,7 @@ from skyquilt import registry
 from skyquilt.effects import MOSAIC, refuse_idle, refuse_untaken
 from skyquilt.errors import UsageError
 from skyquilt.outside import MOST_MP
+from skyquilt.typed import instance, typed
 
 IMAGE_SEARCHES = ("chain", "loop", "overview")
 OPTIMISERS = ("anneal", "surfaces")
@@ -140,6 +141,7 @@ class InputSettings:
     """Write the chosen frames of clips as JPEG files."""
 
     def __post_init__(self) -> None:
+        typed(self)
         within("--max-mp", self.max_mp, 0.01, 10_000)
         if self.thermal_unit is not None:
             one_of("--thermal-unit", self.thermal_unit, THERMAL_UNITS)
@@ -170,6 +172,7 @@ class MatchingSettings:
     """Features per photo."""
 
     def __post_init__(self) -> None:
+        typed(self)
         for stage in ("detector", "matcher", "estimator"):
             word = getattr(self, stage)
             if word is not None:
@@ -195,6 +198,7 @@ class CameraSettings:
     """
 
     def __post_init__(self) -> None:
+        typed(self)
         if self.distortion is not None:
             one_of("--distortion", self.distortion, DISTORTIONS)
         within("--height", self.height_m, 0.5, 1e5)
@@ -211,6 +215,7 @@ class GroundSettings:
     """
 
     def __post_init__(self) -> None:
+        typed(self)
         one_of("--surface", self.surface, SURFACES)
 
 
@@ -242,6 +247,7 @@ class PictureSettings:
     """
 
     def __post_init__(self) -> None:
+        typed(self)
         one_of("--blend", self.blend, ("auto", *BLENDS))
         if self.vertical_datum is not None:
             one_of("--vertical-datum", self.vertical_datum, VERTICAL_DATUMS)
@@ -269,6 +275,7 @@ class OutputSettings:
     """Write contour lines of the bare ground, this many m apart; None = none."""
 
     def __post_init__(self) -> None:
+        typed(self)
         one_of("--compress", self.compress, COMPRESSIONS)
         within("--quality", self.quality, 1, 100)
         within("--contours", self.contours_m, 0.05, 1000)
@@ -296,6 +303,7 @@ class RunningSettings:
         return self.jobs or max(1, min(os.cpu_count() or 1, int(room)))
 
     def __post_init__(self) -> None:
+        typed(self)
         within("--jobs", self.jobs, 0, 1024)
         within("--memory", self.memory_gb, 0.5, 4096)
         within("--seed", self.seed, 0, 2**32 - 1)
@@ -316,6 +324,7 @@ class ImageSettings:
     """Largest height variation on the ground in m; None = a tenth of the flying height."""
 
     def __post_init__(self) -> None:
+        typed(self)
         one_of("--image-search", self.image_search, IMAGE_SEARCHES)
         within("--relief", self.relief_m, 0, 1e4)
 
@@ -330,6 +339,7 @@ class HybridSettings:
     """One of `OPTIMISERS`: how `hybrid` maximises lambda."""
 
     def __post_init__(self) -> None:
+        typed(self)
         one_of("--optimiser", self.optimiser, OPTIMISERS)
         within("--alpha", self.alpha, 0, 1)
 
@@ -342,6 +352,7 @@ class FlightlineSettings:
     """One of `LINES`: how flight lines are told apart."""
 
     def __post_init__(self) -> None:
+        typed(self)
         one_of("--lines", self.lines, LINES)
 
 
@@ -404,7 +415,7 @@ class MosaicSettings:
         object.__setattr__(self, "method", method)
         one_of("--method", method, registry.names("alignment"))
         for name, kind in GROUPS.items():
-            given = options.get(name) or kind()
+            given = instance(name, options.get(name), kind)
             changes = {f.name: getattr(given, f.name) for f in fields(kind)}
             changes |= {k: v for k, v in options.items() if GROUP_OF.get(k) == name}
             object.__setattr__(self, name, kind(**changes))

@@ -38,7 +38,7 @@ IDLE = {
     "pose": ("--surface",),
     "image": ("--surface",),
     "hybrid": ("--surface",),
-    "flightline": ("--surface",),
+    "flightline": ("--surface", "--features"),
     "--trust-metadata": ("--features",),
 }
 """Those that have no effect beside a word: they are refused."""
@@ -47,7 +47,7 @@ IDLE = {
 def quick_beside(words: Sequence[object]) -> list[str]:
     """The options that suit other words of a command."""
     idle = {name for word in words for name in IDLE.get(str(word), ())}
-    if not {"position", "pose", "hybrid"} & set(words):
+    if not {"position", "pose", "hybrid", "flightline"} & set(words):
         idle.discard("--features")
     pairs = zip(QUICK[::2], QUICK[1::2], strict=True)
     return [word for pair in pairs if pair[0] not in idle for word in pair]

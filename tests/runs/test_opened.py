@@ -138,3 +138,20 @@ def test_notebooks_are_legible_in_light_and_dark(finished, flight):
         pictures = re.findall(r"<(?:img|svg|table)[^>]*>", html)
         assert len(pictures) == 2
         assert all("alt=" in p or "aria-label=" in p for p in pictures)
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        ({"gsd_m": 0}, "gsd_m is 0"),
+        ({"gsd_m": -1}, "gsd_m is -1"),
+        ({"gsd_m": float("nan")}, "gsd_m is nan"),
+        ({"gsd_m": "1"}, "gsd_m is '1'"),
+        ({"bounds": (1, 2, 3)}, "bounds has 3 values"),
+        ({"bounds": (1, 2, float("nan"), 4)}, "bounds are .*nan"),
+        ({"bounds": (5, 5, 1, 1)}, "nothing within"),
+    ],
+)
+def test_a_part_that_cannot_be_meant_is_refused(run, asked, words):
+    with pytest.raises(UsageError, match=words):
+        run.raster(**asked)

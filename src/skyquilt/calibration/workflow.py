@@ -26,6 +26,7 @@ from skyquilt.model.calibration import Calibration
 from skyquilt.model.event import Event, Note, Result
 from skyquilt.outside import same_folder
 from skyquilt.photos.survey import read_survey
+from skyquilt.typed import as_path, typed
 
 FEWEST_VIEWS = 3
 STATED = 0.05
@@ -58,6 +59,7 @@ class CalibrateSettings:
     """Threads; 0 = all processors."""
 
     def __post_init__(self) -> None:
+        typed(self)
         if self.series not in SERIES:
             raise UsageError(f"--series {self.series!r} is not one of {', '.join(SERIES)}")
         if self.weights not in WEIGHTS:
@@ -91,7 +93,7 @@ def iter_calibrate(
         RefusedError: mixed cameras, too few boards, or boards that do not determine the lens.
         SkyquiltError: any other error that the user can correct.
     """
-    frames, output, began = Path(frames), Path(output), Clock.now()
+    frames, output, began = as_path("frames", frames), as_path("output", output), Clock.now()
     if frames.is_dir() and same_folder(frames, output):
         raise UsageError(
             f"{output} contains the frames; choose another folder, such as {output / 'calibration'}"

@@ -48,6 +48,7 @@ from skyquilt.photos.pixels import read_color
 from skyquilt.photos.read import rejected
 from skyquilt.raster.tile_store import TileStore
 from skyquilt.settings import MosaicSettings
+from skyquilt.typed import as_path, instance
 from skyquilt.workflows.methods import methods_for
 from skyquilt.workflows.photo_features import PhotoFeatures
 
@@ -81,7 +82,8 @@ class LiveMap:
                 started with other settings.
         """
         cv2.setNumThreads(1)
-        self.folder, self.settings = Path(folder), settings or LiveSettings()
+        self.folder = as_path("folder", folder)
+        self.settings = instance("settings", settings, LiveSettings)
         make_folder(self.folder)
         self.lock = FolderLock(self.folder, LOCK, "live map")
         self.ledger = Ledger(self.folder, write=True)

@@ -21,6 +21,7 @@ from skyquilt.outside import plain
 from skyquilt.photos.headers import APP1, read_jpeg_header
 from skyquilt.photos.pixels import decode_jpeg
 from skyquilt.photos.survey import capture_order, read_survey
+from skyquilt.typed import typed
 
 PREVIEW = 800
 """Longest side in px of previews."""
@@ -48,6 +49,7 @@ class FlySettings:
     """Seed of the random losses and order."""
 
     def __post_init__(self) -> None:
+        typed(self)
         for name, value, low, high in (
             ("--rate", self.rate, 0.01, 1000),
             ("--drones", self.drones, 1, 100),

@@ -28,6 +28,7 @@ from skyquilt.raster.atomic import write_text
 from skyquilt.raster.drivers import GEOTIFF
 from skyquilt.report.page import write_page
 from skyquilt.settings import DEFAULTS, MosaicSettings
+from skyquilt.typed import typed
 from skyquilt.version import __version__
 from skyquilt.workflows.artefacts import REGISTRY
 from skyquilt.workflows.flow import frames_added
@@ -73,7 +74,12 @@ class CompareSettings:
     def asked(self, base: MosaicSettings, name: str) -> MosaicSettings:
         """The settings of a column: those common to all, without what it does not take."""
         others = {s: DEFAULTS[s] for s in OF_METHODS if not taken(VARIANTS[name]["method"], s)}
-        return base.changed(**{**others, **dict(self._own(name)), **VARIANTS[name]})
+        changed = {**others, **dict(self._own(name)), **VARIANTS[name]}
+        values = {**dict(base), **changed}
+        for rule in MOSAIC:
+            if rule.idle(values):
+                changed |= {s: DEFAULTS[s] for s in rule.settings}
+        return base.changed(**changed)
 
     def _own(self, name: str) -> list[tuple[str, Any]]:
         return [(k, v) for k, v in self.given if self._takes(name, k)]
@@ -84,6 +90,7 @@ class CompareSettings:
         return taken(values["method"], setting) and not idle
 
     def __post_init__(self) -> None:
+        typed(self)
         strange = [v for v in self.variants if v not in VARIANTS]
         if strange or not self.variants:
             raise UsageError(

@@ -2,7 +2,7 @@
 
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import pairwise
@@ -26,6 +26,8 @@ from skyquilt.photos.recoded import UNNAMED, recoded
 from skyquilt.photos.side_files import apply_positions
 from skyquilt.photos.side_rows import sentence_of
 from skyquilt.photos.thermal import UNSTATED
+from skyquilt.settings import THERMAL_UNITS, one_of, within
+from skyquilt.typed import as_kind, as_path
 from skyquilt.video.read import CLIP_ENDINGS, side_files
 
 _PHOTO_ENDINGS = frozenset({".jpg", ".jpeg", ".tif", ".tiff", ".png"})
@@ -67,9 +69,14 @@ def find_files(source: Path | Sequence[Path]) -> FoundFiles:
     `run.toml`, or `.skyquilt` while a run is not finished) and of live maps. Raises `UsageError`
     where a given path does not exist.
     """
-    if isinstance(source, (str, Path)) and Path(source).is_dir():
-        return _in_folder(Path(source))
-    paths = [Path(source)] if isinstance(source, (str, Path)) else [Path(p) for p in source]
+    if isinstance(source, (str, os.PathLike)):
+        paths = [as_path("folder", source)]
+        if paths[0].is_dir():
+            return _in_folder(paths[0])
+    elif isinstance(source, Iterable) and not isinstance(source, bytes):
+        paths = [as_path(f"photos[{k}]", p) for k, p in enumerate(source)]
+    else:
+        paths = [as_path("folder", source)]
     for path in paths:
         if not path.exists():
             raise UsageError(f"{path} does not exist; choose a folder of photos.")
@@ -166,6 +173,11 @@ def read_survey(
     that does not exist, `NoPhotosError` where no photo can be read, `SideFileError` for a bad side
     file.
     """
+    geo, cameras = (as_kind(k, v, Path | None) for k, v in (("geo", geo), ("cameras", cameras)))
+    max_mp = as_kind("max_mp", max_mp, float)
+    within("--max-mp", max_mp, 0.01, 10_000)
+    if thermal_unit is not None:
+        one_of("--thermal-unit", thermal_unit, THERMAL_UNITS)
     found = find_files(folder)
     files = [
         read(path, name=name, thermal_unit=thermal_unit, most_mp=max_mp)

@@ -25,6 +25,7 @@ from skyquilt.runs.grid import ExportGrid, grid_of
 from skyquilt.runs.kmz import write_kmz
 from skyquilt.runs.layers import RunLayer, figures_of, layers_in, range_of, unit_of, vertical_of
 from skyquilt.runs.web_tiles import web_tiles, write_mbtiles_file
+from skyquilt.typed import typed
 
 WHAT = ("png", "kmz", "mbtiles", "tiles", "tif", "heights", "footprints")
 """What can be exported."""
@@ -58,6 +59,7 @@ class Wanted:
     """Size of a pixel in m; None = that of the map."""
 
     def __post_init__(self) -> None:
+        typed(self)
         unknown = [w for w in self.what if w not in WHAT]
         if unknown or not self.what:
             raise UsageError(

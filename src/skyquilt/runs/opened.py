@@ -22,6 +22,7 @@ from skyquilt.photos.cameras_json import read_cameras_json
 from skyquilt.raster.map_source import FileSource
 from skyquilt.runs.layers import RunLayer, figures_of, layers_in, unit_of
 from skyquilt.runs.rasters import Raster, as_xarray, read_raster
+from skyquilt.typed import as_path
 
 if TYPE_CHECKING:
     import xarray
@@ -208,7 +209,7 @@ def open_run(folder: Path | str) -> Run:
     Raises:
         UsageError: it holds no finished run.
     """
-    path = Path(folder)
+    path = as_path("folder", folder)
     metrics = figures_of(path)
     if not metrics or "mosaic" not in layers_in(path):
         raise UsageError(

@@ -38,6 +38,7 @@ from skyquilt.thermal.by_pairs import by_homographies, by_pairs
 from skyquilt.thermal.by_rig import draw_rigged, drift_of_rigged, rig_figures, rigged
 from skyquilt.thermal.page import write_figures, write_overlays, write_section
 from skyquilt.thermal.routes import ROUTES, Joined, as_registration, join, opened, refuse_apart
+from skyquilt.typed import as_path, instance
 from skyquilt.workflows.flow import Scene
 from skyquilt.workflows.mosaic import FinishedMap, make_map
 from skyquilt.workflows.survey_input import SurveyInput, read_input
@@ -62,7 +63,7 @@ def iter_thermal(
         RefusedError: the requested method is refused; both maps have been written by then.
         SkyquiltError: any other error that the user can correct.
     """
-    asked, output = settings or MosaicSettings(), Path(output)
+    asked, output = instance("settings", settings, MosaicSettings), as_path("output", output)
     settings, heated = _settings_of_both(asked)
     if route not in ROUTES:
         raise UsageError(f"--thermal-route {route!r} is not one of {', '.join(ROUTES)}")
