@@ -122,7 +122,13 @@ def iter_calibrate(
         seen = replace(seen, rejected=(*unread, *seen.rejected))
         few = settings.few_views and 1 <= len(seen.views) < FEWEST_VIEWS
         if not few:
-            _enough(seen)
+            _enough(seen, few_views=settings.few_views)
+        if settings.few_views and not few:
+            yield Note(
+                text=f"{len(seen.views)} views are enough without the priors of --few-views, which"
+                " has no effect" + (", nor has --focal" if settings.focal_px else ""),
+                warning=True,
+            )
         yield Note(
             text=f"the board was found in {len(seen.views)} of"
             f" {len(seen.views) + len(seen.rejected)} views"
@@ -219,7 +225,7 @@ def _with_priors(
     return widened(by_centres, by_corners), widened(by_corners, by_centres)
 
 
-def _enough(seen: Seen) -> None:
+def _enough(seen: Seen, *, few_views: bool = False) -> None:
     """Refuses too few views for a calibration.
 
     Raises:
@@ -227,13 +233,12 @@ def _enough(seen: Seen) -> None:
     """
     if len(seen.views) >= FEWEST_VIEWS:
         return
+    needed = "one or more is" if few_views else f"{FEWEST_VIEWS} or more are"
+    other = "" if few_views else ", or add --few-views for a lens with assumptions"
     raise RefusedError(
         f"the board was found in {len(seen.views)} of {len(seen.views) + len(seen.rejected)} views,"
-        " and"
-        f" {FEWEST_VIEWS} or more are needed{_reasons(seen.rejected)}; take more, tilted by 20 to"
-        " 40 degrees in"
-        " different directions, the whole board in the frame, or add --few-views for a lens with"
-        " assumptions"
+        f" and {needed} needed{_reasons(seen.rejected)}; take more, tilted by 20 to 40 degrees in"
+        f" different directions, the whole board in the frame{other}"
     )
 
 

@@ -162,7 +162,16 @@ class Checked(TyperCommand):
         Raises:
             UsageError: an option that was given has no effect.
         """
-        sources = {name: ctx.get_parameter_source(name) for name in ctx.params}
-        asked = {n for n, s in sources.items() if s is not None and s.name == "COMMANDLINE"}
-        refuse_idle(RULES.get(str(self.name), ()), ctx.params, asked)
+        refuse(ctx)
         return super().invoke(ctx)
+
+
+def refuse(ctx: Any) -> None:
+    """Refuses what was given and has no effect, of a command that was parsed.
+
+    Raises:
+        UsageError: an option has none.
+    """
+    sources = {name: ctx.get_parameter_source(name) for name in ctx.params}
+    asked = {n for n, s in sources.items() if s is not None and s.name == "COMMANDLINE"}
+    refuse_idle(RULES.get(str(ctx.command.name), ()), ctx.params, asked)
