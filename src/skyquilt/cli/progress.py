@@ -24,6 +24,7 @@ def show_live(events: Iterable["Event | Update"], url: str, *, mode: str) -> Non
         _line({"event": "ServerThread", "url": url})
     elif mode == "normal":
         sys.stdout.write(f"{url} shows the map; Ctrl-C ends, the same command continues\n")
+        sys.stdout.flush()  # into a log too, before the first photo arrives
     for happened in events:
         if mode == "json":
             _line(
