@@ -114,7 +114,8 @@ def fly(folder: Path, to: str, settings: FlySettings, token: str | None = None) 
     web = to.startswith(("http://", "https://"))
     if not web and not Path(to).is_dir():
         raise UsageError(
-            f"{to} is neither a folder nor a URL; make the folder that 'skyquilt live' watches"
+            f"{to} is neither a folder nor an address such as http://127.0.0.1:8080; make the"
+            " folder that 'skyquilt live' watches"
         )
     began, due = time.monotonic(), 0.0
     middle = len(arrivals) / settings.rate / 2

@@ -19,6 +19,8 @@ SMALLER = 0.8
 """A copy has less than this share of the photo's width; ..."""
 SAME = 0.03
 """... the same shape and the same angle of view, within this share."""
+IS_MAP = "it is a map (a GeoTIFF, placed on the ground), not a photo"
+"""The reason recorded for a map among photos."""
 PREFERRED = ("green", "red")
 """Bands that are shown before others of as many photos: lawns, fields and roads differ in them."""
 
@@ -34,6 +36,16 @@ def without_copies(photos: Iterable[Photo]) -> tuple[tuple[Photo, ...], tuple[Re
                 RejectedPhoto(name=photo.name, reason=f"same file content as {original.name}")
             )
     return tuple(first.values()), tuple(copies)
+
+
+def without_maps(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[RejectedPhoto, ...]]:
+    """The photos without maps among them, which would be drawn as one photo more, and these. Where
+    all files are placed like maps, they are what was asked for.
+    """
+    if all(p.placed for p in photos):
+        return tuple(photos), ()
+    maps = tuple(RejectedPhoto(name=p.name, reason=IS_MAP) for p in photos if p.placed)
+    return tuple(p for p in photos if not p.placed), maps
 
 
 def without_reduced(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[RejectedPhoto, ...]]:

@@ -19,7 +19,7 @@ from skyquilt.photos.implausible_positions import (
     without_outliers,
     without_stuck,
 )
-from skyquilt.photos.left_out import band_note, without_copies, without_reduced
+from skyquilt.photos.left_out import band_note, without_copies, without_maps, without_reduced
 from skyquilt.photos.metadata import INVALID, NO_HEMISPHERE
 from skyquilt.photos.read import ReadPhoto, read_photo
 from skyquilt.photos.recoded import UNNAMED, recoded
@@ -84,6 +84,11 @@ def find_files(source: Path | Sequence[Path]) -> FoundFiles:
 
 
 def _in_folder(folder: Path) -> FoundFiles:
+    if (folder / "run.toml").is_file() and (folder / "mosaic.tif").is_file():
+        raise UsageError(
+            f"{folder} is the folder of a finished run, whose maps are no photos; give the folder"
+            " of the photos"
+        )
     runs: list[str] = []
     unread: list[str] = []
 
@@ -187,6 +192,7 @@ def read_survey(
     films, more_rejected = read_clips(found.clips, geo) if clips else ((), ())
     rejected += more_rejected
     photos, copies = without_copies(p for p in files if isinstance(p, Photo))
+    photos, maps = without_maps(photos)
     photos, reduced = without_reduced(photos)
     if not photos and not films:
         raise NoPhotosError(_nothing_sentence(folder, found, rejected, clips=clips))
@@ -201,7 +207,7 @@ def read_survey(
     photos, implausible = placed_plausibly(photos)
     return Survey(
         photos=photos,
-        rejected=tuple(sorted((*rejected, *copies, *reduced), key=lambda r: r.name)),
+        rejected=tuple(sorted((*rejected, *copies, *maps, *reduced), key=lambda r: r.name)),
         ignored=found.ignored
         if clips
         else tuple(sorted((*found.ignored, *(n for n, _ in found.clips)))),
