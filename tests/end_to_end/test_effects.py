@@ -205,6 +205,8 @@ def test_rules_name_options_that_there_are():
             "plan a.geojson -o OUT --camera FC6310 --gsd 2 --separation 9",
             "--separation .*one drone",
         ),
+        ("simulate OUT --plan p.json --height 80", "--height would .*p.json says it"),
+        ("simulate OUT --plan p.json --lose 2", "--lose would .*p.json says it"),
         ("plan a.geojson -o OUT --gsd 2 --fleet f.toml --drones 3", "--drones .*f.toml says it"),
         ("plan IN -o OUT --camera FC6310 --gsd 2 --width 9", "--width would have .*no lines"),
         ("plan check p.json --area a.geojson", "--area would have .*of its own"),

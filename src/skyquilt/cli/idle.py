@@ -122,6 +122,10 @@ _OF_A_PLAN = (
     *("camera", "gsd", "height", "overlap", "sidelap", "views", "width", "keep_out", "drones"),
     *("start", "fleet", "clearance", "separation", "wind", "deadline", "seconds"),
 )
+_FLOWN = (
+    *("photos", "overlap", "sidelap", "height", "heading", "speed", "stops", "fixed_yaw", "turns"),
+    *("shutter_readout", "aspect", "fisheye", "field_of_view", "drones", "lose"),
+)
 RULES: dict[str, tuple[Rule, ...]] = {
     "export": (
         Rule(settings=("layer",), idle=_layer),
@@ -133,6 +137,7 @@ RULES: dict[str, tuple[Rule, ...]] = {
     "calibrate": (Rule(settings=("weights",), idle=_poses),),
     "fly": (Rule(settings=("token",), idle=_folder), Rule(settings=("seed",), idle=_by_chance)),
     "simulate": (
+        Rule(settings=_FLOWN, idle=_plan),
         Rule(settings=("focal_error",), idle=_untold),
         Rule(settings=("aspect_untold",), idle=_no_dewarp),
         Rule(settings=("thermal_season", "thermal_hour"), idle=_no_thermal),

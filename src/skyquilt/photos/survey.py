@@ -2,13 +2,13 @@
 
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
-from skyquilt.errors import NoPhotosError, UsageError
+from skyquilt.errors import NoPhotosError
 from skyquilt.model.photo import Photo, RejectedPhoto, Survey
 from skyquilt.outside import MOST_MP, plain, walk
 from skyquilt.photos.cameras_json import apply_cameras, read_cameras_json
@@ -19,15 +19,20 @@ from skyquilt.photos.implausible_positions import (
     without_outliers,
     without_stuck,
 )
-from skyquilt.photos.left_out import band_note, without_copies, without_maps, without_reduced
+from skyquilt.photos.left_out import (
+    band_note,
+    paths_of,
+    without_copies,
+    without_maps,
+    without_reduced,
+)
 from skyquilt.photos.metadata import INVALID, NO_HEMISPHERE
 from skyquilt.photos.read import ReadPhoto, read_photo
 from skyquilt.photos.recoded import UNNAMED, recoded
 from skyquilt.photos.side_files import apply_positions
 from skyquilt.photos.side_rows import sentence_of
 from skyquilt.photos.thermal import UNSTATED
-from skyquilt.settings import THERMAL_UNITS, one_of, within
-from skyquilt.typed import as_kind, as_path
+from skyquilt.settings import InputSettings
 from skyquilt.video.read import CLIP_ENDINGS, side_files
 
 _PHOTO_ENDINGS = frozenset({".jpg", ".jpeg", ".tif", ".tiff", ".png"})
@@ -69,26 +74,13 @@ def find_files(source: Path | Sequence[Path]) -> FoundFiles:
     `run.toml`, or `.skyquilt` while a run is not finished) and of live maps. Raises `UsageError`
     where a given path does not exist.
     """
-    if isinstance(source, (str, os.PathLike)):
-        paths = [as_path("folder", source)]
-        if paths[0].is_dir():
-            return _in_folder(paths[0])
-    elif isinstance(source, Iterable) and not isinstance(source, bytes):
-        paths = [as_path(f"photos[{k}]", p) for k, p in enumerate(source)]
-    else:
-        paths = [as_path("folder", source)]
-    for path in paths:
-        if not path.exists():
-            raise UsageError(f"{path} does not exist; choose a folder of photos.")
+    paths = paths_of(source)
+    if isinstance(source, (str, os.PathLike)) and paths[0].is_dir():
+        return _in_folder(paths[0])
     return _listed(paths)
 
 
 def _in_folder(folder: Path) -> FoundFiles:
-    if (folder / "run.toml").is_file() and (folder / "mosaic.tif").is_file():
-        raise UsageError(
-            f"{folder} is the folder of a finished run, whose maps are no photos; give the folder"
-            " of the photos"
-        )
     runs: list[str] = []
     unread: list[str] = []
 
@@ -178,11 +170,8 @@ def read_survey(
     that does not exist, `NoPhotosError` where no photo can be read, `SideFileError` for a bad side
     file.
     """
-    geo, cameras = (as_kind(k, v, Path | None) for k, v in (("geo", geo), ("cameras", cameras)))
-    max_mp = as_kind("max_mp", max_mp, float)
-    within("--max-mp", max_mp, 0.01, 10_000)
-    if thermal_unit is not None:
-        one_of("--thermal-unit", thermal_unit, THERMAL_UNITS)
+    asked = InputSettings(geo=geo, cameras=cameras, thermal_unit=thermal_unit, max_mp=max_mp)
+    geo, cameras, max_mp = asked.geo, asked.cameras, asked.max_mp
     found = find_files(folder)
     files = [
         read(path, name=name, thermal_unit=thermal_unit, most_mp=max_mp)
