@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from skyquilt.engine import lock
-from skyquilt.engine.folder import CONTRACT, PART, STATE, claimed, open_run
+from skyquilt.engine.folder import CONTRACT, FILES, PART, STATE, claimed, open_run
 from skyquilt.engine.lock import NO_LOCKS
 from skyquilt.errors import OutputError
 from skyquilt.version import __version__
@@ -95,6 +95,16 @@ def test_another_run_is_refused_replaced_or_made_again(tmp_path):
     assert not (tmp_path / "mosaic.tif").exists()
 
 
+def test_nothing_of_the_replaced_run_stays_beside_the_new_one(tmp_path):
+    """Not what only some runs write: bare ground or temperatures of other photos."""
+    finish(tmp_path)
+    for name in FILES:
+        (tmp_path / name).write_text("of the earlier run")
+    (tmp_path / "mine.txt").write_text("mine")
+    open_run(tmp_path, "other", overwrite=True)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [STATE, "mine.txt"]
+
+
 def test_one_process_writes_to_a_folder_at_a_time(tmp_path):
     """What the first has made stays, whatever the second asks for; a killed one holds nothing."""
     code = (
@@ -167,7 +177,7 @@ def test_files_and_places_below_files_are_no_folders(tmp_path):
     (tmp_path / "file").write_text("x")
     with pytest.raises(OutputError, match="is a file"):
         open_run(tmp_path / "file", "k", overwrite=True)
-    with pytest.raises(OutputError, match="cannot write"):
+    with pytest.raises(OutputError, match="file is a file; .*out cannot be below it"):
         open_run(tmp_path / "file" / "out", "k", overwrite=True)
 
 

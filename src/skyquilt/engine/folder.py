@@ -191,7 +191,7 @@ def open_run(
         (path / STATE).mkdir(parents=True, exist_ok=True)
         lock = FolderLock(path, f"{STATE}/{LOCK}", "run")
         if taken and not grows:
-            for name in (*CONTRACT, error_log.NAME):
+            for name in (*CONTRACT, *FILES, error_log.NAME):  # none may stay beside another map
                 (path / name).unlink(missing_ok=True)
         if taken:
             shutil.rmtree(path / EXPORTS, ignore_errors=True)  # of the map that is replaced
