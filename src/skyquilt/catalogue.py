@@ -4,6 +4,7 @@ used.
 The rows of `skyquilt.papers` are added here, from above, so that nothing below knows them.
 """
 
+from skyquilt.effects import BY_PIXELS
 from skyquilt.registry import register
 
 DETECTORS = {
@@ -31,8 +32,6 @@ ESTIMATORS = {
     "ecc": "skyquilt.papers.direct_refinement:by_ecc",
     "mi": "skyquilt.papers.direct_refinement:by_mutual_information",
 }
-DIRECT = ("ncc", "phase", "ecc", "mi")
-"""Estimators that register pixels; the others estimate from matches of features."""
 REGISTRATIONS = {
     "auto": "skyquilt.coregistration.methods:auto",
     "sift": "skyquilt.papers.rfae:sift",
@@ -58,24 +57,39 @@ _LINKS = {
 """What methods take that verify links between photos; the estimator is that of their epipolar
 geometry.
 """
+_HEIGHT: dict[str, tuple[str, ...]] = {"height": ()}
+_REPAIRED: dict[str, tuple[str, ...]] = {"trust-metadata": ()}
+_HEIGHTS: dict[str, tuple[str, ...]] = dict.fromkeys(
+    ("distortion", "surface", "dtm", "contours", "vertical-datum"), ()
+)
+"""What methods take that find the heights of the ground."""
+_PLANE: dict[str, tuple[str, ...]] = {"distortion": (), "seed": ()}
 ALIGNMENTS: dict[str, tuple[str, dict[str, tuple[str, ...]]]] = {
-    "auto": ("skyquilt.workflows.methods:auto", {**_LINKS, "vertical-datum": ()}),
-    "bundle": ("skyquilt.workflows.methods:bundle", {**_LINKS, "vertical-datum": ()}),
-    "position": ("skyquilt.workflows.methods:position", {**_LINKS, "heading": ()}),
-    "pose": ("skyquilt.workflows.methods:pose", _LINKS),
+    "auto": ("skyquilt.workflows.methods:auto", _LINKS | _REPAIRED | _HEIGHT | _HEIGHTS),
+    "bundle": ("skyquilt.workflows.methods:bundle", _LINKS | _REPAIRED | _HEIGHT | _HEIGHTS),
+    "position": (
+        "skyquilt.workflows.methods:position",
+        _LINKS | _REPAIRED | _HEIGHT | {"heading": ()},
+    ),
+    "pose": ("skyquilt.workflows.methods:pose", _LINKS | _REPAIRED | _HEIGHT),
     "image": (
         "skyquilt.papers.aligners:image",
         {
             "detector": _ANY,
             "matcher": ("mutual", "one-way"),
-            "estimator": ("ransac", "lmeds", "magsac", "ste", "ste-printed", *DIRECT),
+            "estimator": ("ransac", "lmeds", "magsac", "ste", "ste-printed", *BY_PIXELS),
             "transform": TRANSFORMS,
             "relief": (),
             "levelled": (),
             "image-search": ("chain", "loop", "overview"),
+            **_HEIGHT,
+            **_PLANE,
         },
     ),
-    "hybrid": ("skyquilt.papers.aligners:hybrid", {**_LINKS, "optimiser": ("anneal", "surfaces")}),
+    "hybrid": (
+        "skyquilt.papers.aligners:hybrid",
+        _LINKS | _REPAIRED | _HEIGHT | {"optimiser": ("anneal", "surfaces"), "seed": ()},
+    ),
     "flightline": (
         "skyquilt.papers.aligners:flightline",
         {
@@ -84,6 +98,7 @@ ALIGNMENTS: dict[str, tuple[str, dict[str, tuple[str, ...]]]] = {
             "estimator": ("ste", "ste-printed", "ransac", "lmeds", "magsac"),
             "transform": TRANSFORMS,
             "lines": ("heading", "distance"),
+            **_PLANE,
         },
     ),
 }

@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from skyquilt import registry
+from skyquilt.effects import MOSAIC, refuse_idle, refuse_untaken
 from skyquilt.errors import UsageError
 from skyquilt.outside import MOST_MP
+from skyquilt.typed import instance, typed
 
 IMAGE_SEARCHES = ("chain", "loop", "overview")
 OPTIMISERS = ("anneal", "surfaces")
@@ -139,6 +141,7 @@ class InputSettings:
     """Write the chosen frames of clips as JPEG files."""
 
     def __post_init__(self) -> None:
+        typed(self)
         within("--max-mp", self.max_mp, 0.01, 10_000)
         if self.thermal_unit is not None:
             one_of("--thermal-unit", self.thermal_unit, THERMAL_UNITS)
@@ -169,6 +172,7 @@ class MatchingSettings:
     """Features per photo."""
 
     def __post_init__(self) -> None:
+        typed(self)
         for stage in ("detector", "matcher", "estimator"):
             word = getattr(self, stage)
             if word is not None:
@@ -194,6 +198,7 @@ class CameraSettings:
     """
 
     def __post_init__(self) -> None:
+        typed(self)
         if self.distortion is not None:
             one_of("--distortion", self.distortion, DISTORTIONS)
         within("--height", self.height_m, 0.5, 1e5)
@@ -210,6 +215,7 @@ class GroundSettings:
     """
 
     def __post_init__(self) -> None:
+        typed(self)
         one_of("--surface", self.surface, SURFACES)
 
 
@@ -241,6 +247,7 @@ class PictureSettings:
     """
 
     def __post_init__(self) -> None:
+        typed(self)
         one_of("--blend", self.blend, ("auto", *BLENDS))
         if self.vertical_datum is not None:
             one_of("--vertical-datum", self.vertical_datum, VERTICAL_DATUMS)
@@ -268,6 +275,7 @@ class OutputSettings:
     """Write contour lines of the bare ground, this many m apart; None = none."""
 
     def __post_init__(self) -> None:
+        typed(self)
         one_of("--compress", self.compress, COMPRESSIONS)
         within("--quality", self.quality, 1, 100)
         within("--contours", self.contours_m, 0.05, 1000)
@@ -295,6 +303,7 @@ class RunningSettings:
         return self.jobs or max(1, min(os.cpu_count() or 1, int(room)))
 
     def __post_init__(self) -> None:
+        typed(self)
         within("--jobs", self.jobs, 0, 1024)
         within("--memory", self.memory_gb, 0.5, 4096)
         within("--seed", self.seed, 0, 2**32 - 1)
@@ -315,6 +324,7 @@ class ImageSettings:
     """Largest height variation on the ground in m; None = a tenth of the flying height."""
 
     def __post_init__(self) -> None:
+        typed(self)
         one_of("--image-search", self.image_search, IMAGE_SEARCHES)
         within("--relief", self.relief_m, 0, 1e4)
 
@@ -329,6 +339,7 @@ class HybridSettings:
     """One of `OPTIMISERS`: how `hybrid` maximises lambda."""
 
     def __post_init__(self) -> None:
+        typed(self)
         one_of("--optimiser", self.optimiser, OPTIMISERS)
         within("--alpha", self.alpha, 0, 1)
 
@@ -341,6 +352,7 @@ class FlightlineSettings:
     """One of `LINES`: how flight lines are told apart."""
 
     def __post_init__(self) -> None:
+        typed(self)
         one_of("--lines", self.lines, LINES)
 
 
@@ -359,22 +371,8 @@ GROUPS: dict[str, type] = {
 """Groups by the name of their field."""
 GROUP_OF = {f.name: name for name, kind in GROUPS.items() for f in fields(kind)}
 """Name of a setting -> the group it belongs to."""
-_ASKED = {
-    "detector": ("detector", None),
-    "matcher": ("matcher", None),
-    "estimator": ("estimator", None),
-    "transform": ("transform", None),
-    "relief": ("relief_m", None),
-    "levelled": ("levelled", True),
-    "image-search": ("image_search", "chain"),
-    "optimiser": ("optimiser", "surfaces"),
-    "lines": ("lines", "heading"),
-    "heading": ("heading_deg", None),
-    "vertical-datum": ("vertical_datum", None),
-}
-"""Options of some methods only: the setting, and its value if the option is not given."""
-OPTION_OF = {setting: option for option, (setting, _) in _ASKED.items()}
-"""Setting -> option (without `--`), of those."""
+DEFAULTS = {f.name: f.default for kind in GROUPS.values() for f in fields(kind)}
+"""Name of a setting -> its value if it is not given."""
 
 
 @dataclass(frozen=True, kw_only=True, init=False)
@@ -417,11 +415,13 @@ class MosaicSettings:
         object.__setattr__(self, "method", method)
         one_of("--method", method, registry.names("alignment"))
         for name, kind in GROUPS.items():
-            given = options.get(name) or kind()
+            given = instance(name, options.get(name), kind)
             changes = {f.name: getattr(given, f.name) for f in fields(kind)}
             changes |= {k: v for k, v in options.items() if GROUP_OF.get(k) == name}
             object.__setattr__(self, name, kind(**changes))
-        _check_taken(self)
+        asked = {name for name, value in self if value != DEFAULTS.get(name, value)}
+        refuse_untaken(dict(self), asked)
+        refuse_idle(MOSAIC, dict(self), asked)
 
     def changed(self, **options: Any) -> "MosaicSettings":
         """The same with other values of these settings, by their own names, or of the method."""
@@ -437,34 +437,3 @@ class MosaicSettings:
     def as_table(self) -> dict[str, Any]:
         """Names and values as written to run.toml; unset ones left out."""
         return {k: str(v) if isinstance(v, Path) else v for k, v in self if v is not None}
-
-
-def _check_taken(settings: MosaicSettings) -> None:
-    """Refuses what the method does not take: an option without effect would mislead."""
-    takes, values = registry.row("alignment", settings.method).takes, dict(settings)
-    for option, (setting, unasked) in _ASKED.items():
-        value = values[setting]
-        if value == unasked:
-            continue
-        if option not in takes:
-            others = [n for n in registry.names("alignment") if _takes(n, option)]
-            raise UsageError(
-                f"--{option} is for --method {' or '.join(others)}; the method here is"
-                f" {settings.method}"
-            )
-        if takes[option] and value not in takes[option]:
-            raise UsageError(
-                f"--method {settings.method} takes --{option} {', '.join(takes[option])},"
-                f" not {value}"
-            )
-    if not settings.input.repair and settings.method in ("position", "pose", "hybrid"):
-        asked = [o for o in ("detector", "matcher", "estimator") if values[o] is not None]
-        if asked:
-            raise UsageError(
-                f"--{asked[0]} would have no effect: with --trust-metadata, method"
-                f" {settings.method} compares no photos"
-            )
-
-
-def _takes(method: str, option: str) -> bool:
-    return option in registry.row("alignment", method).takes

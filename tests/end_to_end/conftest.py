@@ -33,6 +33,26 @@ from tests.photos.conftest import gps_exif, with_segment
 
 QUICK = ("--features", "300", "--surface", "ties", "--gsd", "30", "--jobs", "2")
 """Options with which the small flight is mapped in about a second."""
+IDLE = {
+    "position": ("--surface",),
+    "pose": ("--surface",),
+    "image": ("--surface",),
+    "hybrid": ("--surface",),
+    "flightline": ("--surface", "--features"),
+    "--trust-metadata": ("--features",),
+}
+"""Those that have no effect beside a word: they are refused."""
+
+
+def quick_beside(words: Sequence[object]) -> list[str]:
+    """The options that suit other words of a command."""
+    idle = {name for word in words for name in IDLE.get(str(word), ())}
+    if not {"position", "pose", "hybrid", "flightline"} & set(words):
+        idle.discard("--features")
+    pairs = zip(QUICK[::2], QUICK[1::2], strict=True)
+    return [word for pair in pairs if pair[0] not in idle for word in pair]
+
+
 WIDE, HIGH = 480, 360
 """Size of its photos in px."""
 
@@ -143,7 +163,14 @@ def mosaic(tmp_path: Path) -> Mosaic:
         photos: Path, *options: str | Path, output: Path | None = None, quick: bool = True
     ) -> Told:
         output = output or tmp_path / "out"
-        words = ("mosaic", photos, "-o", output, *(QUICK if quick else ()), *options)
+        words = (
+            "mosaic",
+            photos,
+            "-o",
+            output,
+            *(quick_beside(options) if quick else ()),
+            *options,
+        )
         code, out, err = skyquilt(*words)
         return Told(code=code, out=out, err=err, output=output)
 

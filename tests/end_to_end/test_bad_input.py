@@ -659,3 +659,22 @@ def test_metadata_of_another_kind_than_foreseen(mosaic, photos):
     path.write_bytes(with_segment(data, 0xE1, piexif.dump(exif)))
     told = mosaic(photos).made()
     assert told.metrics["photos_used"] == 9
+
+
+# maps among photos
+
+
+def test_maps_among_the_photos_are_left_out(mosaic, photos, finished):
+    """An orthophoto saved beside them had been drawn as one photo more."""
+    for name in ("mosaic.tif", "dsm.tif"):
+        shutil.copy(finished / name, photos / f"earlier {name}")
+    told = mosaic(photos).made()
+    assert told.metrics["photos_used"] == 9
+    rejected = told.metrics["photos_rejected"]
+    assert sorted(rejected) == ["earlier dsm.tif", "earlier mosaic.tif"]
+    assert all("it is a map" in why for why in rejected.values())
+
+
+def test_the_folder_of_a_run_is_no_folder_of_photos(mosaic, finished, tmp_path):
+    told = mosaic(finished, output=tmp_path / "again").refused(2, "folder of a finished run")
+    assert not told.output.exists()

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,9 @@ import pytest
 import tifffile
 
 from skyquilt.calibration.files import CONTRACT
-from skyquilt.calibration.workflow import CalibrateSettings, calibrate
+from skyquilt.calibration.workflow import CalibrateSettings, calibrate, iter_calibrate
 from skyquilt.errors import NoPhotosError, OutputError, RefusedError, UsageError
+from skyquilt.model.event import Note
 from skyquilt.photos.cameras_json import read_cameras_json
 from skyquilt.simulate.board import tilted
 from tests.calibration.boards import LENS, frame, frontal, poses
@@ -86,6 +88,18 @@ def test_too_few_views_are_refused_with_the_reasons(tmp_path):
 
 
 @pytest.mark.slow
+def test_few_views_that_are_many_or_none(frames, tmp_path):
+    """What is said fits the option."""
+    asked = replace(SETTINGS, few_views=True, focal_px=700.0)
+    events = list(iter_calibrate(frames, tmp_path / "many", asked))
+    (note,) = [e.text for e in events if isinstance(e, Note) and "no effect" in e.text]
+    assert "5 views are enough" in note and "nor has --focal" in note
+    write(tmp_path / "in", "wall.tif", np.full((480, 640), 300.0))
+    with pytest.raises(RefusedError, match="one or more is needed") as refused:
+        calibrate(tmp_path / "in", tmp_path / "none", asked)
+    assert "--few-views" not in str(refused.value)
+
+
 def test_boards_that_are_never_tilted_are_refused(tmp_path):
     for k in range(3):
         pose = tilted(0, 0, 8 * k, (0.02 * k, 0, 1.7))

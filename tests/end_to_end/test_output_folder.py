@@ -71,7 +71,7 @@ def same_result(a: Path, b: Path) -> None:
 def test_output_below_a_file(mosaic, flight, tmp_path):
     (tmp_path / "file").write_text("x")
     mosaic(flight / "photos", output=tmp_path / "file" / "out").refused(
-        5, "cannot write to", "another output folder"
+        5, "file is a file", "out cannot be below it", "another output folder"
     )
     mosaic(flight / "photos", output=tmp_path / "file").refused(5, "is a file", "folder")
     assert (tmp_path / "file").read_text() == "x"

@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 
 from skyquilt.engine import lock
-from skyquilt.engine.folder import CONTRACT, STATE, claimed, open_run
+from skyquilt.engine.folder import CONTRACT, FILES, PART, STATE, claimed, open_run
 from skyquilt.engine.lock import NO_LOCKS
 from skyquilt.errors import OutputError
+from skyquilt.version import __version__
 
 
 def finish(path, key="k"):
@@ -27,6 +28,7 @@ def test_a_new_folder_and_its_parents_are_made(tmp_path):
     assert json.loads((run.path / STATE / "run.json").read_text()) == {
         "key": "k",
         "state": "running",
+        "version": __version__,
     }
 
 
@@ -47,6 +49,43 @@ def test_the_same_run_is_done_or_resumed(tmp_path):
     assert (tmp_path / "mosaic.tif").exists()
 
 
+def cut(path):
+    path.write_bytes(path.read_bytes()[:-1])
+
+
+def hole(path):
+    """What a disk leaves that lost power: the right size, zeros at the end."""
+    content = bytearray(path.read_bytes())
+    middle, rest = len(content) // 2, len(content) - len(content) // 2
+    content[middle:] = bytes(rest)
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("size", [40, 3 * PART, 3_000_001])
+@pytest.mark.parametrize("spoil", [cut, hole, Path.unlink, lambda p: p.write_bytes(b"")])
+def test_a_finished_file_that_is_damaged_is_made_again(tmp_path, size, spoil):
+    run = finish(tmp_path)
+    optional = tmp_path / "dsm.tif"
+    optional.write_bytes(bytes(range(1, 251)) * (size // 250) + b"x" * (size % 250))
+    run.mark("done")
+    assert run.done and run.changed == ()
+    (tmp_path / "metrics.json").write_text("a thermal map was added")
+    assert run.done
+    spoil(optional)
+    assert run.changed == ("dsm.tif",) and not run.done
+
+
+def test_a_run_of_another_version_is_named(tmp_path):
+    finish(tmp_path)
+    state = tmp_path / STATE / "run.json"
+    record = json.loads(state.read_text())
+    for version, words in (("0.0.1", "version 0.0.1"), (None, "an earlier version")):
+        record["version"] = version
+        state.write_text(json.dumps({k: v for k, v in record.items() if v}))
+        with pytest.raises(OutputError, match=rf"{words} of Skyquilt, and this is version"):
+            open_run(tmp_path, "other", overwrite=False)
+
+
 def test_another_run_is_refused_replaced_or_made_again(tmp_path):
     finish(tmp_path)
     with pytest.raises(OutputError, match=r"another run.*--overwrite"):
@@ -54,6 +93,16 @@ def test_another_run_is_refused_replaced_or_made_again(tmp_path):
     assert (tmp_path / "mosaic.tif").exists()
     open_run(tmp_path, "other", overwrite=False, again=True)
     assert not (tmp_path / "mosaic.tif").exists()
+
+
+def test_nothing_of_the_replaced_run_stays_beside_the_new_one(tmp_path):
+    """Not what only some runs write: bare ground or temperatures of other photos."""
+    finish(tmp_path)
+    for name in FILES:
+        (tmp_path / name).write_text("of the earlier run")
+    (tmp_path / "mine.txt").write_text("mine")
+    open_run(tmp_path, "other", overwrite=True)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [STATE, "mine.txt"]
 
 
 def test_one_process_writes_to_a_folder_at_a_time(tmp_path):
@@ -128,7 +177,7 @@ def test_files_and_places_below_files_are_no_folders(tmp_path):
     (tmp_path / "file").write_text("x")
     with pytest.raises(OutputError, match="is a file"):
         open_run(tmp_path / "file", "k", overwrite=True)
-    with pytest.raises(OutputError, match="cannot write"):
+    with pytest.raises(OutputError, match="file is a file; .*out cannot be below it"):
         open_run(tmp_path / "file" / "out", "k", overwrite=True)
 
 

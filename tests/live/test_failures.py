@@ -9,7 +9,9 @@ import sys
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
+import rasterio
 
 from skyquilt.engine.lock import FolderLock
 from skyquilt.errors import OutputError
@@ -66,6 +68,19 @@ def test_a_thin_photo_is_refused_and_the_others_are_mapped(flight, tmp_path):
     assert "20000x32" in refused(live)["a.jpg"]
     state = live.ledger.row("select state from photo where name = 'b.jpg'")
     assert state is not None and state[0] in ("placed", "refined", "waiting")
+    live.close()
+
+
+def test_a_map_in_the_inbox_is_refused_and_the_others_are_mapped(flight, tmp_path):
+    inbox = tmp_path / "in"
+    inbox.mkdir()
+    about = {"width": 400, "height": 300, "count": 3, "dtype": "uint8", "crs": "EPSG:32633"}
+    place = rasterio.Affine(0.1, 0, 446_000, 0, -0.1, 5_160_000)
+    with rasterio.open(inbox / "a.tif", "w", driver="GTiff", transform=place, **about) as to:
+        to.write(np.random.default_rng(0).integers(0, 255, (3, 300, 400), np.uint8))
+    shutil.copyfile(flight.photos[0], inbox / "b.jpg")
+    live = taken(tmp_path / "out", inbox, 2)
+    assert "it is a map" in refused(live)["a.tif"]
     live.close()
 
 

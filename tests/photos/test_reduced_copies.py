@@ -6,7 +6,7 @@ from datetime import datetime
 import pytest
 
 from skyquilt.model.photo import GeoPosition
-from skyquilt.photos.left_out import without_reduced
+from skyquilt.photos.left_out import without_maps, without_reduced
 from tests.alignment.surveys import photo
 
 
@@ -59,3 +59,10 @@ def test_without_metadata_anywhere_equal_names_tell_nothing():
     bare = [replace(p, time=None, position=None) for p in FULL]
     small = replace(bare[0], name="second/DJI_0000.JPG", width=2000, height=1500)
     assert without_reduced([*bare, small])[1] == ()
+
+
+def test_maps_are_left_out_but_not_where_all_files_are_placed():
+    maps = [taken("old.tif", 5, placed=True), taken("dsm.tif", 6, placed=True)]
+    kept, out = without_maps([*FULL, *maps])
+    assert list(kept) == FULL and {r.name for r in out} == {"old.tif", "dsm.tif"}
+    assert without_maps(maps) == (tuple(maps), ())

@@ -4,6 +4,7 @@ import time
 import numpy as np
 import pytest
 
+from skyquilt.alignment.outcome import UNSETTLED
 from skyquilt.errors import OutputError
 from skyquilt.report import CameraResiduals, ReportInput, SeamMark, Shot, build_report, write_report
 from skyquilt.report.attention import attention
@@ -278,6 +279,17 @@ def test_the_head_says_when_how_high_and_with_what_and_links_the_files():
 
 def attended(**changes):
     return [words for words, _ in attention(run(**changes))]
+
+
+def test_what_the_alignment_warned_of_is_worth_a_look_once():
+    metrics = {"accuracy": {"focal_sigma_after_over_before": 0.97, "vertical_m": {"median": 1.1}}}
+    (own,) = [w for w in attended(metrics=metrics) if "focal length" in w]
+    told = (f"{UNSETTLED} of a camera: 1.1 m.", "The photos of <b> seem to be stretched")
+    found = attended(metrics=metrics, doubts=told)
+    assert own not in found and [w for w in found if "focal" in w] == [told[0]]
+    assert any("seem to be stretched" in w for w in found)
+    page = build_report(run(metrics=metrics, doubts=told))
+    assert "seem to be stretched" in page and "photos of <b>" not in page
 
 
 def test_worth_a_look_names_what_is_worst_and_nothing_where_all_is_well():

@@ -1,6 +1,7 @@
 """Exports, read back by GDAL and compared with the run's own rasters."""
 
 import json
+import shutil
 import sqlite3
 import zipfile
 from contextlib import closing
@@ -13,8 +14,9 @@ from rasterio.warp import Resampling, reproject
 from typer.testing import CliRunner
 
 from skyquilt.cli import app as commands
-from skyquilt.errors import UsageError
+from skyquilt.errors import OutputError, SideFileError, UsageError
 from skyquilt.runs.export import WHAT, Wanted, export
+from skyquilt.runs.opened import open_run
 
 
 @pytest.fixture(scope="module")
@@ -165,3 +167,45 @@ def test_the_command_and_the_short_cut_of_mosaic_are_one(finished, flight, tmp_p
     assert said.exit_code == 0 and said.output.count("export: ") == 2
     wrong = run(commands.app, ["mosaic", str(flight), "-o", str(tmp_path / "x"), "--export", "gif"])
     assert isinstance(wrong.exception, UsageError) and not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("file", ["mosaic.tif", "dsm.tif"])
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.97])
+def test_a_raster_that_was_cut_off_is_told_in_plain_words(finished, tmp_path, file, share):
+    run = shutil.copytree(finished.output, tmp_path / "run")
+    whole = (run / file).read_bytes()
+    (run / file).write_bytes(whole[: int(share * len(whole))])
+    what = "heights" if file == "dsm.tif" else "tif"
+    with pytest.raises(SideFileError, match=rf"{file} cannot be read as a map: it is damaged, or"):
+        list(export(run, Wanted(what=(what,))))
+    with pytest.raises(SideFileError, match="cannot be read as a map"):
+        open_run(run).raster("heights" if file == "dsm.tif" else "mosaic")
+
+
+def test_a_surface_model_that_is_rubbish_is_not_replaced_by_the_ground(finished, tmp_path):
+    run = shutil.copytree(finished.output, tmp_path / "run")
+    (run / "dsm.tif").write_text("rubbish")
+    with pytest.raises(UsageError, match="has no heights"):
+        list(export(run, Wanted(what=("heights",))))
+    (run / "dsm.tif").unlink()  # as runs without one
+    assert [e.path.name for e in export(run, Wanted(what=("heights",)))] == ["heights.tif"]
+
+
+def test_a_map_that_was_changed_after_its_run_is_named(finished, tmp_path):
+    """A JPEG tile of zeros is no error for GDAL."""
+    run = shutil.copytree(finished.output, tmp_path / "run")
+    (done,) = export(run, Wanted(what=("png",)), tmp_path / "before")
+    assert done.note == ""
+    content = bytearray((run / "mosaic.tif").read_bytes())
+    content[len(content) // 2 : len(content) // 2 + 400] = bytes(400)
+    (run / "mosaic.tif").write_bytes(content)
+    (done,) = export(run, Wanted(what=("png",)), tmp_path / "after")
+    assert done.note == "mosaic.tif is not as the run wrote it"
+
+
+def test_a_file_in_place_of_the_folder_is_told(finished, tmp_path):
+    (tmp_path / "taken").write_text("mine")
+    for place in (tmp_path / "taken", tmp_path / "taken" / "below"):
+        with pytest.raises(OutputError, match="taken is a file; .*choose another output folder"):
+            list(export(finished.output, Wanted(what=("png",)), place))
+    assert (tmp_path / "taken").read_text() == "mine"

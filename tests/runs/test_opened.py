@@ -2,13 +2,17 @@
 
 import re
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import rasterio
 
 import skyquilt
+from skyquilt.engine.store import Store
 from skyquilt.errors import UsageError
+from skyquilt.workflows.artefacts import REGISTRY
+from skyquilt.workflows.finished import NAME, STAGE
 
 
 @pytest.fixture(scope="module")
@@ -80,6 +84,22 @@ def test_without_its_store_a_run_says_what_is_missing(finished, tmp_path):
         skyquilt.open_run(tmp_path / "nowhere")
 
 
+def test_observations_are_those_of_the_map_whatever_the_clock_says(finished, tmp_path):
+    """A clock set back between two runs makes an older alignment the newer file."""
+    folder = shutil.copytree(finished.output, tmp_path / "run")
+    store = Store(folder=folder / ".skyquilt" / "store", registry=REGISTRY)
+    made = store.get(STAGE, NAME)
+    own = store.get("alignment", made.alignment)
+    poses = {i: replace(p, map_C=p.map_C + 7.0) for i, p in own.poses.items()}
+    other = replace(own, poses=poses, ties=replace(own.ties, xyz=own.ties.xyz + 7.0))
+    store.put("alignment", "f" * 32, other)
+    expected = skyquilt.open_run(finished.output).observations
+    assert np.array_equal(skyquilt.open_run(folder).observations.points, expected.points)
+    store.put(STAGE, NAME, replace(made, alignment="f" * 32))
+    with pytest.raises(UsageError, match="not those of the map"):
+        _ = skyquilt.open_run(folder).observations
+
+
 def test_what_notebooks_show_is_short_and_holds_a_map(run, finished, flight):
     result, survey = finished.events[-1], skyquilt.read_survey(flight / "photos")
     for thing in (run, result, survey):
@@ -118,3 +138,20 @@ def test_notebooks_are_legible_in_light_and_dark(finished, flight):
         pictures = re.findall(r"<(?:img|svg|table)[^>]*>", html)
         assert len(pictures) == 2
         assert all("alt=" in p or "aria-label=" in p for p in pictures)
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        ({"gsd_m": 0}, "gsd_m is 0"),
+        ({"gsd_m": -1}, "gsd_m is -1"),
+        ({"gsd_m": float("nan")}, "gsd_m is nan"),
+        ({"gsd_m": "1"}, "gsd_m is '1'"),
+        ({"bounds": (1, 2, 3)}, "bounds has 3 values"),
+        ({"bounds": (1, 2, float("nan"), 4)}, "bounds are .*nan"),
+        ({"bounds": (5, 5, 1, 1)}, "nothing within"),
+    ],
+)
+def test_a_part_that_cannot_be_meant_is_refused(run, asked, words):
+    with pytest.raises(UsageError, match=words):
+        run.raster(**asked)

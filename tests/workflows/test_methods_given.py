@@ -32,7 +32,8 @@ def off_m(flight, output):
 
 def placed(flight, tmp_path, **asked):
     gcp = next(flight.rglob("gcp_list.txt"))
-    result = mosaic(flight / "photos", tmp_path / "out", MosaicSettings(gcp=gcp, **QUICK, **asked))
+    quick = {k: v for k, v in QUICK.items() if k != "surface" or "method" not in asked}
+    result = mosaic(flight / "photos", tmp_path / "out", MosaicSettings(gcp=gcp, **quick, **asked))
     assert result.metrics["photos_used"] == 9
     return result
 

@@ -28,7 +28,7 @@ def test_defaults(tmp_path):
 
 def test_every_setting_comes_back(tmp_path):
     asked = MosaicSettings(
-        method="position",
+        method="auto",
         gsd_cm=2.5,
         crs="EPSG:32633",
         gcp=Path("a b/gcp_list.txt"),
@@ -39,11 +39,10 @@ def test_every_setting_comes_back(tmp_path):
         surface="ties",
         blend="multiband",
         balance=False,
-        compress="zstd",
+        compress="jpeg",
         quality=70,
         distortion="6t",
         height_m=60.0,
-        heading_deg=-90.0,
         repair=False,
         features=4000,
         jobs=2,

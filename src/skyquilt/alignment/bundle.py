@@ -94,7 +94,7 @@ class Bundle:
             part = (
                 keep.within(f"{begun.name}{sorted(begun.aside)}")
                 if len(photos) > self.many
-                else Keep(workers=keep.workers)
+                else Keep(workers=keep.workers, told=keep.told)
             )
             own = enlarged(begun)
             return self._block(
@@ -224,6 +224,7 @@ class Bundle:
         del step, near
         problem, state, frame, reports = hold_to_control(problem, state, frame, setup, control)
         make_room()
+        keep.tell("outcome")
         ties = ground_points(aside.get(), setup, state)
         make_room()
         done = _outcome(

@@ -24,6 +24,8 @@ UNDETERMINED = 0.4
 """A focal length whose deviation stays above this share of its prior's is not determined: what the
 metadata say of it counts for a sixth or more.
 """
+UNSETTLED = "This flight does not determine the focal length"
+"""How the sentence begins that says so of a camera."""
 STRETCHED = 5.0
 """A ratio of focal lengths this many deviations off its prior shows a stretched picture."""
 UNFIT = 0.3
@@ -144,7 +146,7 @@ def undetermined(
         told = float(problem.sigma_K[row, 0] / state.K[row, 0])
         if problem.free[row, 0] and share > UNDETERMINED * told and share * height > 0.01:
             notes.append(
-                f"This flight does not determine the focal length of {key}: it stays about as"
+                f"{UNSETTLED} of {key}: it stays about as"
                 f" uncertain as its metadata ({100 * share:.1f} %), and heights of the ground with"
                 f" it ({share * height:.2g} m, one standard deviation); control points, oblique"
                 " photos or lines at two heights would."

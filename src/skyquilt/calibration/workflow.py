@@ -26,6 +26,7 @@ from skyquilt.model.calibration import Calibration
 from skyquilt.model.event import Event, Note, Result
 from skyquilt.outside import same_folder
 from skyquilt.photos.survey import read_survey
+from skyquilt.typed import as_path, typed
 
 FEWEST_VIEWS = 3
 STATED = 0.05
@@ -58,6 +59,7 @@ class CalibrateSettings:
     """Threads; 0 = all processors."""
 
     def __post_init__(self) -> None:
+        typed(self)
         if self.series not in SERIES:
             raise UsageError(f"--series {self.series!r} is not one of {', '.join(SERIES)}")
         if self.weights not in WEIGHTS:
@@ -91,7 +93,7 @@ def iter_calibrate(
         RefusedError: mixed cameras, too few boards, or boards that do not determine the lens.
         SkyquiltError: any other error that the user can correct.
     """
-    frames, output, began = Path(frames), Path(output), Clock.now()
+    frames, output, began = as_path("frames", frames), as_path("output", output), Clock.now()
     if frames.is_dir() and same_folder(frames, output):
         raise UsageError(
             f"{output} contains the frames; choose another folder, such as {output / 'calibration'}"
@@ -120,7 +122,13 @@ def iter_calibrate(
         seen = replace(seen, rejected=(*unread, *seen.rejected))
         few = settings.few_views and 1 <= len(seen.views) < FEWEST_VIEWS
         if not few:
-            _enough(seen)
+            _enough(seen, few_views=settings.few_views)
+        if settings.few_views and not few:
+            yield Note(
+                text=f"{len(seen.views)} views are enough without the priors of --few-views, which"
+                " has no effect" + (", nor has --focal" if settings.focal_px else ""),
+                warning=True,
+            )
         yield Note(
             text=f"the board was found in {len(seen.views)} of"
             f" {len(seen.views) + len(seen.rejected)} views"
@@ -217,7 +225,7 @@ def _with_priors(
     return widened(by_centres, by_corners), widened(by_corners, by_centres)
 
 
-def _enough(seen: Seen) -> None:
+def _enough(seen: Seen, *, few_views: bool = False) -> None:
     """Refuses too few views for a calibration.
 
     Raises:
@@ -225,13 +233,12 @@ def _enough(seen: Seen) -> None:
     """
     if len(seen.views) >= FEWEST_VIEWS:
         return
+    needed = "one or more is" if few_views else f"{FEWEST_VIEWS} or more are"
+    other = "" if few_views else ", or add --few-views for a lens with assumptions"
     raise RefusedError(
         f"the board was found in {len(seen.views)} of {len(seen.views) + len(seen.rejected)} views,"
-        " and"
-        f" {FEWEST_VIEWS} or more are needed{_reasons(seen.rejected)}; take more, tilted by 20 to"
-        " 40 degrees in"
-        " different directions, the whole board in the frame, or add --few-views for a lens with"
-        " assumptions"
+        f" and {needed} needed{_reasons(seen.rejected)}; take more, tilted by 20 to 40 degrees in"
+        f" different directions, the whole board in the frame{other}"
     )
 
 

@@ -18,6 +18,7 @@ from skyquilt.cli import simulate as simulate_command
 from skyquilt.cli import spectral_bench as spectral_bench_command
 from skyquilt.cli import strip_test as strip_test_command
 from skyquilt.cli import view as view_command
+from skyquilt.cli.idle import Checked
 from skyquilt.version import __version__
 
 EXIT_CODES = (
@@ -27,20 +28,20 @@ EXIT_CODES = (
 )
 
 app = typer.Typer(no_args_is_help=True, add_completion=True, pretty_exceptions_enable=False)
-app.command("mosaic", epilog=EXIT_CODES)(mosaic_command.command)
-app.command("compare", epilog=EXIT_CODES)(compare_command.command)
-app.command("export", epilog=EXIT_CODES)(export_command.command)
-app.command("live", epilog=EXIT_CODES)(live_command.command)
-app.command("view", epilog=EXIT_CODES)(view_command.command)
-app.command("fly", epilog=EXIT_CODES)(fly_command.command)
+app.command("mosaic", cls=Checked, epilog=EXIT_CODES)(mosaic_command.command)
+app.command("compare", cls=Checked, epilog=EXIT_CODES)(compare_command.command)
+app.command("export", cls=Checked, epilog=EXIT_CODES)(export_command.command)
+app.command("live", cls=Checked, epilog=EXIT_CODES)(live_command.command)
+app.command("view", cls=Checked, epilog=EXIT_CODES)(view_command.command)
+app.command("fly", cls=Checked, epilog=EXIT_CODES)(fly_command.command)
 app.add_typer(plan_command.app, name="plan", epilog=EXIT_CODES)
-app.command("inspect", epilog=EXIT_CODES)(inspect_command.command)
-app.command("register", epilog=EXIT_CODES)(register_command.command)
-app.command("depth", epilog=EXIT_CODES)(depth_command.command)
-app.command("calibrate", epilog=EXIT_CODES)(calibrate_command.command)
-app.command("spectral-bench", epilog=EXIT_CODES)(spectral_bench_command.command)
-app.command("simulate", epilog=EXIT_CODES)(simulate_command.command)
-app.command("strip-test", epilog=EXIT_CODES)(strip_test_command.command)
+app.command("inspect", cls=Checked, epilog=EXIT_CODES)(inspect_command.command)
+app.command("register", cls=Checked, epilog=EXIT_CODES)(register_command.command)
+app.command("depth", cls=Checked, epilog=EXIT_CODES)(depth_command.command)
+app.command("calibrate", cls=Checked, epilog=EXIT_CODES)(calibrate_command.command)
+app.command("spectral-bench", cls=Checked, epilog=EXIT_CODES)(spectral_bench_command.command)
+app.command("simulate", cls=Checked, epilog=EXIT_CODES)(simulate_command.command)
+app.command("strip-test", cls=Checked, epilog=EXIT_CODES)(strip_test_command.command)
 
 
 def _version(asked: bool) -> None:

@@ -96,7 +96,7 @@ def command(
     with ends_at_once():
         from skyquilt.cli.progress import show
         from skyquilt.papers.compare import VARIANTS, CompareSettings, iter_compare
-        from skyquilt.settings import MosaicSettings
+        from skyquilt.settings import DEFAULTS, MosaicSettings
 
     mode = mode_of(quiet=quiet, json=json)
     shared = MosaicSettings(
@@ -104,18 +104,14 @@ def command(
         geo=geo,
         cameras=cameras,
         thermal_unit=thermal_unit,
-        height_m=height,
         alpha=alpha,
-        repair=repair,
-        seed=seed,
         jobs=jobs,
         distances=distances,
     )
     asked = tuple(m.strip() for m in methods.split(",")) if methods is not None else tuple(VARIANTS)
-    named = {"detector": detector, "matcher": matcher, "estimator": estimator}
-    given = [(k, v) for k, v in named.items() if v is not None]
-    if lines != "heading":
-        given.append(("lines", lines))
+    named: dict[str, Any] = {"detector": detector, "matcher": matcher, "estimator": estimator}
+    named |= {"height_m": height, "lines": lines, "repair": repair, "seed": seed}
+    given = [(k, v) for k, v in named.items() if v is not None and v != DEFAULTS[k]]
     settings = CompareSettings(
         mosaic=shared, variants=asked, first=first, known=known, given=tuple(given)
     )

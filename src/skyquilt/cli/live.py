@@ -17,6 +17,7 @@ from skyquilt.cli.options import (
     Shutter,
     ShutterReadout,
     ThermalUnit,
+    mode_of,
 )
 from skyquilt.outside import MOST_MP
 
@@ -147,6 +148,7 @@ def command(
         from skyquilt.server.layer_files import layer_of_file
         from skyquilt.server.server_process import ServerConfig, ServerProcess
         from skyquilt.settings import within
+    mode = mode_of(quiet=quiet, json=json)
     within("--max-mb", max_mb, 0.01, 1e5)
     within("--max-clip-mb", max_clip_mb, 0.01, 1e6)
     within("--viewer-memory", viewer_memory, *MEMORY_GB)
@@ -196,6 +198,6 @@ def command(
         ):
             live.lock.tell(serving.url)
             events = iter_live(inbox, live, finish=finish, fill=fill)
-            show_live(events, serving.url, mode="quiet" if quiet else "json" if json else "normal")
+            show_live(events, serving.url, mode=mode)
     finally:
         live.close()

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from skyquilt.cli.idle import Checked
 from skyquilt.cli.interrupt import ends_at_once
 from skyquilt.cli.options import Json, Overwrite, Quiet, mode_of
 
@@ -35,7 +36,7 @@ def plan() -> None:
     """Plan a mission: `plan AREA -o PLAN`; `plan check FILE` checks one."""
 
 
-@app.command("area")
+@app.command("area", cls=Checked)
 def command(
     area: Annotated[
         Path,
@@ -148,7 +149,7 @@ def summary(result: "Result") -> str:
     ))  # fmt: skip
 
 
-@app.command("check")
+@app.command("check", cls=Checked)
 def check(
     file: Annotated[Path, typer.Argument(help="plan.json, .plan, .waypoints or .kmz.")],
     area: Annotated[Path | None, typer.Option(help="Areas that it has to cover.")] = None,

@@ -24,6 +24,7 @@ def show_live(events: Iterable["Event | Update"], url: str, *, mode: str) -> Non
         _line({"event": "ServerThread", "url": url})
     elif mode == "normal":
         sys.stdout.write(f"{url} shows the map; Ctrl-C ends, the same command continues\n")
+        sys.stdout.flush()  # into a log too, before the first photo arrives
     for happened in events:
         if mode == "json":
             _line(
@@ -133,18 +134,22 @@ def _on_terminal(events: Iterable[Event], console: "Console", *, verbose: bool) 
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
+        TextColumn("{task.fields[what]}"),
     )
     with Progress(*columns, console=console) as progress:
         tasks: dict[str, Any] = {}
         for happened in events:
             if isinstance(happened, StageStarted):
-                tasks[happened.stage] = progress.add_task(happened.stage, total=None)
+                tasks[happened.stage] = progress.add_task(happened.stage, total=None, what="")
             elif isinstance(happened, StageProgress):
                 progress.update(
-                    tasks[happened.stage], completed=happened.done, total=happened.total
+                    tasks[happened.stage],
+                    completed=happened.done,
+                    total=happened.total,
+                    what=happened.what,
                 )
             elif isinstance(happened, StageFinished):
-                progress.update(tasks[happened.stage], completed=1, total=1)
+                progress.update(tasks[happened.stage], completed=1, total=1, what="")
                 if verbose:
                     progress.console.print(times(happened))
             elif isinstance(happened, Note):

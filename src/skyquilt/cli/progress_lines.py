@@ -30,6 +30,7 @@ class ProgressLines:
     _since: float = 0.0
     _done: int = 0
     _total: int = 0
+    _what: str = ""
     _end: threading.Event = field(default_factory=threading.Event)
 
     def __enter__(self) -> Self:
@@ -50,9 +51,9 @@ class ProgressLines:
         for happened in events:
             if isinstance(happened, StageStarted):
                 self._since, self._done, self._total = time.monotonic(), 0, happened.total
-                self._stage = happened.stage
+                self._stage, self._what = happened.stage, ""
             elif isinstance(happened, StageProgress):
-                self._done, self._total = happened.done, happened.total
+                self._done, self._total, self._what = happened.done, happened.total, happened.what
             elif isinstance(happened, StageFinished):
                 self._stage = ""
                 self.write(_ended(happened, verbose=self.verbose))
@@ -66,7 +67,8 @@ class ProgressLines:
         while not self._end.wait(self.every_s):
             if stage := self._stage:
                 part = f", {self._done} of {self._total}" if self._total else ""
-                self.write(f"{stage}: {time.monotonic() - self._since:.0f} s so far{part}")
+                what = f" ({self._what})" if self._what else ""
+                self.write(f"{stage}: {time.monotonic() - self._since:.0f} s so far{part}{what}")
 
 
 def _ended(happened: StageFinished, *, verbose: bool) -> str:

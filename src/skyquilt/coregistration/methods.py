@@ -11,6 +11,7 @@ from skyquilt.errors import UsageError
 from skyquilt.matching.ransac import Ransac
 from skyquilt.model.registration import Registers
 from skyquilt.settings import one_of
+from skyquilt.typed import typed
 
 SAMPLES = 1000
 """Most samples drawn for a similarity: enough for 7 % of right matches."""
@@ -36,6 +37,7 @@ class RegisterSettings:
     """
 
     def __post_init__(self) -> None:
+        typed(self)
         one_of("--method", self.method, registry.names("registration"))
         if self.tolerance_px is None:
             return

@@ -25,6 +25,7 @@ from skyquilt.model.photo import RejectedPhoto
 from skyquilt.model.registration import Guess, Outcome, RefusedRegistration, Registration
 from skyquilt.quality.registration_quality import spread_quality
 from skyquilt.raster.atomic import write_text
+from skyquilt.typed import as_path, instance
 from skyquilt.version import __version__
 
 STAGES = ("read", "register", "draw")
@@ -55,7 +56,8 @@ def iter_register(
         RefusedError: there is no registration to be trusted; raised after the `Result`.
         SkyquiltError: anything else a user can correct.
     """
-    settings, output = settings or RegisterSettings(), Path(output)
+    settings = instance("settings", settings, RegisterSettings)
+    a, b, output = as_path("a", a), as_path("b", b), as_path("output", output)
     opened = open_picture(Path(a)), open_picture(Path(b))
     with claimed(output, CONTRACT, overwrite=overwrite):
         yield StageStarted(stage="register", total=1)

@@ -44,6 +44,7 @@ from skyquilt.model.event import Event, Note, Result
 from skyquilt.model.surface import Surface
 from skyquilt.raster.atomic import write_text
 from skyquilt.settings import MosaicSettings, within
+from skyquilt.typed import as_path, instance
 from skyquilt.version import __version__
 from skyquilt.workflows.artefacts import REGISTRY
 from skyquilt.workflows.flow import Scene, align_photos, find_ground, frames_added, scene_of
@@ -94,7 +95,8 @@ def iter_depth(
         RefusedError: no two photos determine a height.
         SkyquiltError: any other error that the user can correct.
     """
-    settings, output, began = settings or MosaicSettings(), Path(output), Clock.now()
+    settings, began = instance("settings", settings, MosaicSettings), Clock.now()
+    output = as_path("output", output)
     if route not in ROUTES:
         raise UsageError(f"--route {route!r} is not one of {', '.join(ROUTES)}")
     within("--relief", relief_m, 0, 10_000)

@@ -1,8 +1,11 @@
 """Time per stage, reported as events."""
 
 import sys
+import threading
 import time
-from collections.abc import Generator
+from collections import deque
+from collections.abc import Callable, Generator
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,8 +17,12 @@ from skyquilt.engine.workers import HERE, Workers
 from skyquilt.model.event import Event, StageFinished, StageProgress, StageStarted
 
 T = TypeVar("T")
-Steps = Generator[tuple[int, int] | Event, None, T]
-"""Generator of a stage: yields (done, total) or events, returns its result."""
+Step = tuple[int, int] | tuple[int, int, str]
+"""Done, total, and what is done now."""
+Steps = Generator[Step | Event, None, T]
+"""Generator of a stage: yields steps or events, returns its result."""
+HEARD_S = 0.25
+"""How often in s a step is asked for that is computed apart."""
 
 
 def result_of(steps: Generator[Any, None, T]) -> T:
@@ -26,6 +33,50 @@ def result_of(steps: Generator[Any, None, T]) -> T:
         except StopIteration as stop:
             found: T = stop.value
             return found
+
+
+class _Left(BaseException):
+    """Ends a computation whose result nobody waits for."""
+
+
+def apart(work: Callable[[Callable[[str], None]], T], step: Callable[[str], Step]) -> Steps[T]:
+    """Computes in a thread of its own, and yields a step for each part that `work` names to what it
+    is called with: one long computation tells how far it is, and Ctrl-C ends it at once.
+
+    A generator that is closed early waits for the end of the part.
+    """
+    heard: deque[str] = deque()
+    left = threading.Event()
+
+    def tell(part: str) -> None:
+        if left.is_set():
+            raise _Left
+        heard.append(part)
+
+    last: Step = (0, 1)
+    yield last
+    pool = ThreadPoolExecutor(1, thread_name_prefix="apart")
+    found = pool.submit(work, tell)
+    waits = True
+    try:
+        while not found.done():
+            wait([found], HEARD_S)
+            while heard:
+                last = step(heard.popleft())
+                yield last
+    except KeyboardInterrupt:
+        waits = False
+        raise
+    finally:
+        left.set()
+        pool.shutdown(wait=waits)
+    result = found.result()
+    yield last[1], last[1]
+    return result
+
+
+def _progress(stage: str, done: int, total: int, what: str = "") -> StageProgress:
+    return StageProgress(stage=stage, done=done, total=total, what=what)
 
 
 def cpu_seconds() -> float:
@@ -90,11 +141,7 @@ class Clock:
         try:
             while True:
                 step = next(work)
-                yield (
-                    StageProgress(stage=name, done=step[0], total=step[1])
-                    if isinstance(step, tuple)
-                    else step
-                )
+                yield _progress(name, *step) if isinstance(step, tuple) else step
                 yield from self.workers.news()
         except StopIteration as stop:
             result: T = stop.value

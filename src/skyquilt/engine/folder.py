@@ -1,18 +1,20 @@
 """The run folder: who may write there, what may be resumed, and errors such as a full disk."""
 
 import errno
+import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from skyquilt.engine import error_log
 from skyquilt.engine.lock import FolderLock
 from skyquilt.errors import OutputError
-from skyquilt.outside import read_bounded
+from skyquilt.outside import open_regular, plain, read_bounded
+from skyquilt.version import __version__
 
 CONTRACT = (
     "mosaic.tif",
@@ -47,6 +49,10 @@ FILES = {
     "run.toml": "settings",
 }
 """Files of a run, in the order of the links."""
+LASTING = tuple(name for name in FILES if name not in ("metrics.json", "thermal.tif"))
+"""Those that nothing changes once the run is finished; a thermal map is added afterwards."""
+PART, PARTS = 1 << 14, 256
+"""Bytes of a part of a file, and how many parts tell whether it is whole."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,12 +72,15 @@ class RunFolder:
         return self.path / STATE / "store"
 
     def mark(self, state: str) -> None:
-        """Records the state of the run: `running` or `done`."""
+        """Records the state of the run, `running` or `done`, and what finished files hold."""
         target = self.path / STATE / "run.json"
         partial = target.with_suffix(".partial")
+        record: dict[str, object] = {"key": self.key, "state": state, "version": __version__}
         try:
+            if state == "done":
+                record["files"] = {n: s for n in LASTING if (s := stamp(self.path / n))}
             target.parent.mkdir(parents=True, exist_ok=True)  # removed by somebody while it ran
-            partial.write_text(json.dumps({"key": self.key, "state": state}))
+            partial.write_text(json.dumps(record))
             partial.replace(target)
         except OSError as error:
             partial.unlink(missing_ok=True)
@@ -95,17 +104,63 @@ class RunFolder:
     @property
     def done(self) -> bool:
         """Whether a run with the same key was finished before."""
-        return _state(self.path) == (self.key, "done") and all(
-            (self.path / name).is_file() for name in CONTRACT
-        )
+        known = _known(self.path)
+        return (known.key, known.state) == (self.key, "done") and not self.changed
+
+    @property
+    def changed(self) -> tuple[str, ...]:
+        """Files of a finished run that are gone, or do not hold what was written."""
+        return changed(self.path) if _known(self.path).state == "done" else ()
 
 
-def _state(path: Path) -> tuple[str, str]:
+def changed(path: Path) -> tuple[str, ...]:
+    """Files of the finished run in a folder that are gone, or do not hold what was written: a copy
+    that was cut off, a disk that lost power, a program that wrote into them.
+    """
+    known = _known(path).files
+    names = dict.fromkeys((*CONTRACT, *known))
+    found = {name: stamp(path / name) for name in names}
+    return tuple(n for n, now in found.items() if not now or known.get(n, now) != now)
+
+
+def stamp(path: Path) -> str:
+    """Size and hash of a file; of a large one, of parts spread over it. Empty where there is
+    none.
+    """
+    try:
+        with open_regular(path) as file:
+            size = file.seek(0, os.SEEK_END)
+            apart = max(PART, (size - PART) // (PARTS - 1))
+            content = hashlib.blake2b(digest_size=16)
+            for place in range(0, size, apart):
+                file.seek(place)
+                content.update(file.read(PART))
+            file.seek(max(0, size - PART))
+            content.update(file.read(PART))
+    except OSError:
+        return ""
+    return f"{size} {content.hexdigest()}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Known:
+    """What a folder's run.json says; empty where there is none that can be read."""
+
+    key: str = ""
+    state: str = ""
+    version: str = ""
+    files: Mapping[str, str] = field(default_factory=dict)
+    """Stamps of a finished run's files."""
+
+
+def _known(path: Path) -> _Known:
     try:
         found = json.loads(read_bounded(path / STATE / "run.json"))
-        return str(found["key"]), str(found["state"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return "", ""
+        files = {n: str(s) for n, s in dict(found.get("files", {})).items() if n in LASTING}
+        words = {k: str(found[k]) for k in ("key", "state")}
+        return _Known(**words, version=str(found.get("version", "")), files=files)
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        return _Known()
 
 
 def open_run(
@@ -121,21 +176,22 @@ def open_run(
         OutputError: it holds something else, another run works in it, or it cannot be written.
     """
     _refuse_file(path)
-    known, state = _state(path)
+    was = _known(path)
     try:
         taken = (
-            path.is_dir() and any(p.name != STATE or known for p in path.iterdir()) and known != key
+            path.is_dir()
+            and any(p.name != STATE or was.key for p in path.iterdir())
+            and was.key != key
         )
-        if taken and not overwrite and not ((again or grows) and known):
-            what = "another run (other photos or other settings)" if known else "other files"
+        if taken and not overwrite and not ((again or grows) and was.key):
             raise OutputError(
-                f"{path} already holds {what}; add --overwrite to replace its results,"
+                f"{path} already holds {_other(was)}; add --overwrite to replace its results,"
                 " or choose another folder"
             )
         (path / STATE).mkdir(parents=True, exist_ok=True)
         lock = FolderLock(path, f"{STATE}/{LOCK}", "run")
         if taken and not grows:
-            for name in (*CONTRACT, error_log.NAME):
+            for name in (*CONTRACT, *FILES, error_log.NAME):  # none may stay beside another map
                 (path / name).unlink(missing_ok=True)
         if taken:
             shutil.rmtree(path / EXPORTS, ignore_errors=True)  # of the map that is replaced
@@ -145,9 +201,19 @@ def open_run(
     except OSError as error:
         raise refusal(path, error) from error
     folder = RunFolder(path=path, key=key, lock=lock)
-    if state != "done" or known != key:
+    if was.state != "done" or was.key != key:
         folder.mark("running")
     return folder
+
+
+def _other(was: _Known) -> str:
+    """What a folder holds that is not this run."""
+    if not was.key:
+        return "other files"
+    if was.version == __version__:
+        return "another run (other photos or other settings)"
+    its = f"version {plain(was.version, 40)}" if was.version else "an earlier version"
+    return f"a run of {its} of Skyquilt, and this is version {__version__}"
 
 
 @contextmanager
@@ -181,10 +247,27 @@ def claimed(path: Path, names: Sequence[str], *, overwrite: bool) -> Iterator[No
         lock.remove()
 
 
+def make_folder(path: Path) -> None:
+    """Creates a folder for results where it is missing.
+
+    Raises:
+        OutputError: it, or a folder above it, is a file or a link to nowhere, or cannot be written.
+    """
+    _refuse_file(path)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise refusal(path, error) from error
+
+
 def _refuse_file(path: Path) -> None:
-    if os.path.lexists(path) and not path.is_dir():
-        what = "a file" if path.exists() else "a link that leads nowhere"
-        raise OutputError(f"{path} is {what}; the output is a folder")
+    place = path
+    while not os.path.lexists(place) and place != place.parent:
+        place = place.parent
+    if os.path.lexists(place) and not place.is_dir():
+        what = "a file" if place.exists() else "a link that leads nowhere"
+        why = "the output is a folder" if place == path else f"{path} cannot be below it"
+        raise OutputError(f"{place} is {what}; {why}; choose another output folder")
 
 
 def _refuse_files(path: Path, overwrite: bool) -> None:

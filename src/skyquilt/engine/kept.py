@@ -23,13 +23,21 @@ class Keep:
     """Make parts that do not depend on one another."""
     prefix: str = ""
     """Begins the names of all parts."""
+    told: Callable[[str], None] | None = None
+    """Hears the name of each part before it is given or made; it may end the step by raising."""
 
     def __call__(self, part: str, make: Callable[[], T], /) -> T:
         """The part; `make` computes it."""
+        self.tell(part)
         if self.held is None:
             return make()
         found: T = self.held(self.prefix + part, make)
         return found
+
+    def tell(self, part: str) -> None:
+        """Says that a part begins."""
+        if self.told is not None:
+            self.told(self.prefix + part)
 
     def missing(self, parts: Iterable[str]) -> list[str]:
         """Those of these parts that will be made, in their order."""

@@ -18,6 +18,7 @@ import numpy as np
 
 from skyquilt.engine.error_log import NAME as ERRORS
 from skyquilt.engine.error_log import log_error
+from skyquilt.engine.folder import make_folder
 from skyquilt.engine.free_memory import give_back
 from skyquilt.engine.lock import FolderLock
 from skyquilt.engine.pixel_cache import PixelCache
@@ -47,6 +48,7 @@ from skyquilt.photos.pixels import read_color
 from skyquilt.photos.read import rejected
 from skyquilt.raster.tile_store import TileStore
 from skyquilt.settings import MosaicSettings
+from skyquilt.typed import as_path, instance
 from skyquilt.workflows.methods import methods_for
 from skyquilt.workflows.photo_features import PhotoFeatures
 
@@ -80,11 +82,9 @@ class LiveMap:
                 started with other settings.
         """
         cv2.setNumThreads(1)
-        self.folder, self.settings = Path(folder), settings or LiveSettings()
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
+        self.folder = as_path("folder", folder)
+        self.settings = instance("settings", settings, LiveSettings)
+        make_folder(self.folder)
         self.lock = FolderLock(self.folder, LOCK, "live map")
         self.ledger = Ledger(self.folder, write=True)
         self._same_settings()

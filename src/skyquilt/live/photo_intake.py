@@ -16,6 +16,7 @@ from skyquilt.live.ledger import Ledger, hit
 from skyquilt.live.settings import LiveSettings
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.outside import open_regular, plain
+from skyquilt.photos.left_out import IS_MAP
 from skyquilt.photos.read import read_photo, rejected
 from skyquilt.video.srt import MOST_TELEMETRY_BYTES
 
@@ -138,6 +139,9 @@ class Intake:
             if photo.trace:
                 log_error(self.ledger.path.parent, f"{name}: {photo.reason}", photo.trace)
             return self.refuse(name, source, photo.reason)
+        if photo.placed:
+            gone(arrived.path)
+            return self.refuse(name, source, IS_MAP)
         try:
             return self._row(arrived, photo, name, source)
         except OutputError:

@@ -21,6 +21,7 @@ from skyquilt.outside import plain
 from skyquilt.photos.headers import APP1, read_jpeg_header
 from skyquilt.photos.pixels import decode_jpeg
 from skyquilt.photos.survey import capture_order, read_survey
+from skyquilt.typed import typed
 
 PREVIEW = 800
 """Longest side in px of previews."""
@@ -48,6 +49,7 @@ class FlySettings:
     """Seed of the random losses and order."""
 
     def __post_init__(self) -> None:
+        typed(self)
         for name, value, low, high in (
             ("--rate", self.rate, 0.01, 1000),
             ("--drones", self.drones, 1, 100),
@@ -112,7 +114,8 @@ def fly(folder: Path, to: str, settings: FlySettings, token: str | None = None) 
     web = to.startswith(("http://", "https://"))
     if not web and not Path(to).is_dir():
         raise UsageError(
-            f"{to} is neither a folder nor a URL; make the folder that 'skyquilt live' watches"
+            f"{to} is neither a folder nor an address such as http://127.0.0.1:8080; make the"
+            " folder that 'skyquilt live' watches"
         )
     began, due = time.monotonic(), 0.0
     middle = len(arrivals) / settings.rate / 2

@@ -6,6 +6,7 @@ from typing import Any
 from skyquilt.errors import UsageError
 from skyquilt.outside import MOST_MP
 from skyquilt.settings import THERMAL_UNITS, VERTICAL_DATUMS, check_shutter, one_of
+from skyquilt.typed import typed
 
 NEIGHBOURS = 8
 """Largest number of placed photos with which a new one is compared."""
@@ -73,6 +74,7 @@ class LiveSettings:
     """Largest number of photos accepted."""
 
     def __post_init__(self) -> None:
+        typed(self)
         if self.thermal_unit is not None:
             one_of("--thermal-unit", self.thermal_unit, THERMAL_UNITS)
         check_shutter(self.shutter, self.shutter_readout_ms)

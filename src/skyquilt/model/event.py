@@ -29,7 +29,9 @@ class StageProgress:
     done: int
     """Steps done."""
     total: int
-    """Steps in all."""
+    """Steps in all; it may grow."""
+    what: str = ""
+    """What is done now, where a step takes long."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -127,6 +127,8 @@ class Photo:
     """1 or 3 (or more, multi-band TIFF)."""
     dtype: Literal["uint8", "uint16", "float32"]
     """Type of the decoded pixels."""
+    placed: bool = False
+    """Whether its file tells where on the ground its pixels lie, as a map does (GeoTIFF)."""
     alpha: bool = False
     """Whether pixels may be see-through; these are black, or NaN where values are real numbers."""
     saved_grey: bool = False

@@ -169,11 +169,8 @@ def image(settings: MosaicSettings) -> ByImage:
 
 
 def _direct_chain(settings: MosaicSettings) -> DirectChain:
-    """`image` by pixels: options that concern features are refused, since no features are used."""
+    """`image` by pixels."""
     name, asked = str(settings.matching.estimator), settings.matching
-    for option, value in (("detector", asked.detector), ("matcher", asked.matcher)):
-        if value is not None:
-            raise UsageError(f"--{option} would have no effect: --estimator {name} compares pixels")
     if settings.image.image_search != "chain":
         raise UsageError(f"--estimator {name} registers two photos: --image-search is chain")
     model = asked.transform or DIRECT[name][0]

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from skyquilt import registry
+from skyquilt.effects import MOSAIC, OF_METHODS, option_of, taken
 from skyquilt.engine.clock import Clock
 from skyquilt.engine.folder import STATE
 from skyquilt.engine.store import Store, digest
@@ -27,7 +27,8 @@ from skyquilt.photos.gcp import read_gcp_list
 from skyquilt.raster.atomic import write_text
 from skyquilt.raster.drivers import GEOTIFF
 from skyquilt.report.page import write_page
-from skyquilt.settings import OPTION_OF, MosaicSettings
+from skyquilt.settings import DEFAULTS, MosaicSettings
+from skyquilt.typed import typed
 from skyquilt.version import __version__
 from skyquilt.workflows.artefacts import REGISTRY
 from skyquilt.workflows.flow import frames_added
@@ -71,14 +72,25 @@ class CompareSettings:
     """Settings of single methods (names and values); each column gets those that apply to it."""
 
     def asked(self, base: MosaicSettings, name: str) -> MosaicSettings:
-        """The settings of a column."""
-        return base.changed(**{**dict(self._own(name)), **VARIANTS[name]})
+        """The settings of a column: those common to all, without what it does not take."""
+        others = {s: DEFAULTS[s] for s in OF_METHODS if not taken(VARIANTS[name]["method"], s)}
+        changed = {**others, **dict(self._own(name)), **VARIANTS[name]}
+        values = {**dict(base), **changed}
+        for rule in MOSAIC:
+            if rule.idle(values):
+                changed |= {s: DEFAULTS[s] for s in rule.settings}
+        return base.changed(**changed)
 
     def _own(self, name: str) -> list[tuple[str, Any]]:
-        takes = registry.row("alignment", VARIANTS[name]["method"]).takes
-        return [(k, v) for k, v in self.given if OPTION_OF.get(k, k) in takes]
+        return [(k, v) for k, v in self.given if self._takes(name, k)]
+
+    def _takes(self, name: str, setting: str) -> bool:
+        values = {**DEFAULTS, **dict(self.mosaic), **dict(self.given), **VARIANTS[name]}
+        idle = any(setting in rule.settings and rule.idle(values) for rule in MOSAIC)
+        return taken(values["method"], setting) and not idle
 
     def __post_init__(self) -> None:
+        typed(self)
         strange = [v for v in self.variants if v not in VARIANTS]
         if strange or not self.variants:
             raise UsageError(
@@ -89,8 +101,9 @@ class CompareSettings:
         taken = {k for v in self.variants for k, _ in self._own(v)}
         for setting, _ in self.given:
             if setting not in taken:
-                option = OPTION_OF.get(setting, setting)
-                raise UsageError(f"--{option} has no effect on {', '.join(self.variants)}")
+                raise UsageError(
+                    f"--{option_of(setting)} has no effect on {', '.join(self.variants)}"
+                )
         for name in self.variants:
             self.asked(self.mosaic, name)  # refuses invalid values at once
 
@@ -123,9 +136,9 @@ def iter_compare(
     base, says = _judged_by(given, output, settings)
     state.write(output)
     for name in settings.variants:
-        yield from rows.run(name, settings.asked(base, name))
-        if name in TRUSTED and settings.mosaic.input.repair and rows.contradicted(name):
-            asked = settings.asked(base, name)
+        asked = settings.asked(base, name)
+        yield from rows.run(name, asked)
+        if name in TRUSTED and asked.input.repair and rows.contradicted(name):
             trusting = asked.changed(repair=False, detector=None, matcher=None, estimator=None)
             yield from rows.run(f"{name}-trusted", trusting)
     order = [n for v in settings.variants for n in (v, f"{v}-trusted") if n in rows.by_name]

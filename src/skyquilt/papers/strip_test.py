@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from skyquilt.engine.folder import make_folder
 from skyquilt.errors import OutputError, UsageError
 from skyquilt.model.event import Event, Result, StageFinished, StageProgress, StageStarted
 from skyquilt.papers.strip_chain import VARIANTS, calibrated, chained
@@ -65,8 +66,8 @@ def iter_strip_test(
 
 def _make_room(output: Path, overwrite: bool) -> None:
     """Creates the folder, and removes a former result."""
+    make_folder(output)
     try:
-        output.mkdir(parents=True, exist_ok=True)
         taken = [name for name in FILES if (output / name).exists()]
         if taken and not overwrite:
             raise OutputError(

@@ -5,10 +5,11 @@ photos do not, and would make the map as coarse as they are. Multispectral camer
 each band: a map of all of them would be a patchwork of bands, so it shows one.
 """
 
+import os
 from collections import Counter, defaultdict
 from collections.abc import Hashable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 
 from skyquilt.errors import UsageError
 from skyquilt.model.photo import Photo, RejectedPhoto, Survey
@@ -19,8 +20,39 @@ SMALLER = 0.8
 """A copy has less than this share of the photo's width; ..."""
 SAME = 0.03
 """... the same shape and the same angle of view, within this share."""
+IS_MAP = "it is a map (a GeoTIFF, placed on the ground), not a photo"
+"""The reason recorded for a map among photos."""
 PREFERRED = ("green", "red")
 """Bands that are shown before others of as many photos: lawns, fields and roads differ in them."""
+
+
+def paths_of(source: object) -> list[Path]:
+    """Paths of a folder, or of single photos.
+
+    Raises:
+        UsageError: it is neither, is not there, or is the folder of a finished run, whose maps are
+            no photos.
+    """
+    paths: list[Path] = []
+    try:
+        if isinstance(source, (str, os.PathLike)):
+            paths = [Path(source)] if str(source) else []
+        elif isinstance(source, Iterable) and not isinstance(source, bytes):
+            paths = [Path(p) for p in source]
+    except TypeError:
+        paths = []
+    if not paths and source != []:
+        told = " ".join(repr(source).split())[:60]
+        raise UsageError(f"{told} is neither a folder nor a list of photos")
+    for path in paths:
+        if not path.exists():
+            raise UsageError(f"{path} does not exist; choose a folder of photos.")
+        if (path / "run.toml").is_file() and (path / "mosaic.tif").is_file():
+            raise UsageError(
+                f"{path} is the folder of a finished run, whose maps are no photos; give the folder"
+                " of the photos"
+            )
+    return paths
 
 
 def without_copies(photos: Iterable[Photo]) -> tuple[tuple[Photo, ...], tuple[RejectedPhoto, ...]]:
@@ -34,6 +66,16 @@ def without_copies(photos: Iterable[Photo]) -> tuple[tuple[Photo, ...], tuple[Re
                 RejectedPhoto(name=photo.name, reason=f"same file content as {original.name}")
             )
     return tuple(first.values()), tuple(copies)
+
+
+def without_maps(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[RejectedPhoto, ...]]:
+    """The photos without maps among them, which would be drawn as one photo more, and these. Where
+    all files are placed like maps, they are what was asked for.
+    """
+    if all(p.placed for p in photos):
+        return tuple(photos), ()
+    maps = tuple(RejectedPhoto(name=p.name, reason=IS_MAP) for p in photos if p.placed)
+    return tuple(p for p in photos if not p.placed), maps
 
 
 def without_reduced(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[RejectedPhoto, ...]]:

@@ -196,6 +196,7 @@ def _photo(path: Path, name: str, header: Header, thermal_unit: str | None) -> P
         height=height,
         channels=1 if frame else header.channels,
         dtype="float32" if frame else header.dtype,
+        placed=_is_placed(header),
         alpha=header.alpha,
         band="thermal" if lens.thermal else "visible",
         unit=frame.unit if frame else "",
@@ -232,6 +233,12 @@ def _ignoring(read: Callable[[], T], otherwise: Callable[[], T], what: str, note
             f" ({type(error).__name__}: {plain(str(error), 100)})."
         )
         return otherwise()
+
+
+def _is_placed(header: Header) -> bool:
+    """Whether a TIFF has a coordinate system and places its pixels in it (GeoTIFF 1.1)."""
+    tags = header.exif.tags
+    return tag.GEO_KEYS in tags and (tag.PIXEL_SCALE in tags or tag.PIXEL_MATRIX in tags)
 
 
 def _bare(header: Header) -> Header:

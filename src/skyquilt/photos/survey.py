@@ -8,7 +8,7 @@ from datetime import datetime
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
-from skyquilt.errors import NoPhotosError, UsageError
+from skyquilt.errors import NoPhotosError
 from skyquilt.model.photo import Photo, RejectedPhoto, Survey
 from skyquilt.outside import MOST_MP, plain, walk
 from skyquilt.photos.cameras_json import apply_cameras, read_cameras_json
@@ -19,13 +19,20 @@ from skyquilt.photos.implausible_positions import (
     without_outliers,
     without_stuck,
 )
-from skyquilt.photos.left_out import band_note, without_copies, without_reduced
+from skyquilt.photos.left_out import (
+    band_note,
+    paths_of,
+    without_copies,
+    without_maps,
+    without_reduced,
+)
 from skyquilt.photos.metadata import INVALID, NO_HEMISPHERE
 from skyquilt.photos.read import ReadPhoto, read_photo
 from skyquilt.photos.recoded import UNNAMED, recoded
 from skyquilt.photos.side_files import apply_positions
 from skyquilt.photos.side_rows import sentence_of
 from skyquilt.photos.thermal import UNSTATED
+from skyquilt.settings import InputSettings
 from skyquilt.video.read import CLIP_ENDINGS, side_files
 
 _PHOTO_ENDINGS = frozenset({".jpg", ".jpeg", ".tif", ".tiff", ".png"})
@@ -67,12 +74,9 @@ def find_files(source: Path | Sequence[Path]) -> FoundFiles:
     `run.toml`, or `.skyquilt` while a run is not finished) and of live maps. Raises `UsageError`
     where a given path does not exist.
     """
-    if isinstance(source, (str, Path)) and Path(source).is_dir():
-        return _in_folder(Path(source))
-    paths = [Path(source)] if isinstance(source, (str, Path)) else [Path(p) for p in source]
-    for path in paths:
-        if not path.exists():
-            raise UsageError(f"{path} does not exist; choose a folder of photos.")
+    paths = paths_of(source)
+    if isinstance(source, (str, os.PathLike)) and paths[0].is_dir():
+        return _in_folder(paths[0])
     return _listed(paths)
 
 
@@ -166,6 +170,8 @@ def read_survey(
     that does not exist, `NoPhotosError` where no photo can be read, `SideFileError` for a bad side
     file.
     """
+    asked = InputSettings(geo=geo, cameras=cameras, thermal_unit=thermal_unit, max_mp=max_mp)
+    geo, cameras, max_mp = asked.geo, asked.cameras, asked.max_mp
     found = find_files(folder)
     files = [
         read(path, name=name, thermal_unit=thermal_unit, most_mp=max_mp)
@@ -175,6 +181,7 @@ def read_survey(
     films, more_rejected = read_clips(found.clips, geo) if clips else ((), ())
     rejected += more_rejected
     photos, copies = without_copies(p for p in files if isinstance(p, Photo))
+    photos, maps = without_maps(photos)
     photos, reduced = without_reduced(photos)
     if not photos and not films:
         raise NoPhotosError(_nothing_sentence(folder, found, rejected, clips=clips))
@@ -189,7 +196,7 @@ def read_survey(
     photos, implausible = placed_plausibly(photos)
     return Survey(
         photos=photos,
-        rejected=tuple(sorted((*rejected, *copies, *reduced), key=lambda r: r.name)),
+        rejected=tuple(sorted((*rejected, *copies, *maps, *reduced), key=lambda r: r.name)),
         ignored=found.ignored
         if clips
         else tuple(sorted((*found.ignored, *(n for n, _ in found.clips)))),

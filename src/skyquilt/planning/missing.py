@@ -23,7 +23,7 @@ from skyquilt.planning.points import is_shut
 from skyquilt.planning.records import Plan, Site
 from skyquilt.planning.site import geographic, make_site, read_keep_out
 from skyquilt.planning.terrain import FLAT
-from skyquilt.raster.drivers import GEOTIFF
+from skyquilt.raster.drivers import GEOTIFF, why_unreadable
 
 VIEWS = "views.tif"
 COVERAGE = "coverage.tif"
@@ -80,8 +80,12 @@ def read_mission_state(folder: Path) -> FlownMission:
         with rasterio.open(folder / COVERAGE, driver=GEOTIFF) as raster:
             values = raster.read(1)
             affine = raster.transform
-    except (OSError, ValueError, LookupError, TypeError, rasterio.errors.RasterioError) as error:
-        raise SideFileError(f"{folder}: {STATE} or {COVERAGE} is damaged: {error}") from error
+    except rasterio.errors.RasterioError as error:
+        raise SideFileError(
+            f"{folder / COVERAGE} cannot be read: {why_unreadable(error)}"
+        ) from error
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise SideFileError(f"{folder / STATE} is damaged: {error}") from error
     like = planned_cover(plan)
     inside = values != OUTSIDE
     if inside.shape != like.inside.shape:
@@ -129,7 +133,7 @@ def missing_site(folder: Path, views: int, *, keep_out: Path | None = None) -> S
             crs = raster.crs.to_string()
             outside = raster.nodata if name == COVERAGE else None
     except rasterio.errors.RasterioError as error:
-        raise SideFileError(f"{folder / name} cannot be read: {error}") from error
+        raise SideFileError(f"{folder / name} cannot be read: {why_unreadable(error)}") from error
     asked = counts != outside if outside is not None else _hull(counts > 0)
     short = asked & (counts < views)
     pieces = [

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 
 from skyquilt.errors import UsageError
+from skyquilt.typed import typed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +35,9 @@ class PlanSettings:
     """The last drone has to land by then."""
     seconds: float = 12.0
     """Time to search for routes."""
+
+    def __post_init__(self) -> None:
+        typed(self)
 
     def checked(self) -> "PlanSettings":
         """The settings unchanged; raises UsageError where values cannot be meant."""

@@ -13,7 +13,7 @@ from shapely.geometry.base import BaseGeometry
 from skyquilt.errors import SideFileError
 from skyquilt.outside import plain
 from skyquilt.planning.records import Array
-from skyquilt.raster.drivers import GEOTIFF
+from skyquilt.raster.drivers import GEOTIFF, why_unreadable
 
 MOST_SIDE = 3000
 """Largest number of heights along one side."""
@@ -119,7 +119,11 @@ def read_terrain(path: Path, crs: str, area: BaseGeometry, margin: float) -> Ter
                 dst_nodata=np.nan,
                 resampling=Resampling.bilinear,
             )
-    except (rasterio.errors.RasterioError, rasterio.errors.CRSError, ValueError) as error:
+    except rasterio.errors.RasterioError as error:
+        raise SideFileError(
+            f"{path.name} cannot be read as a raster of heights: {why_unreadable(error)}"
+        ) from error
+    except (rasterio.errors.CRSError, ValueError) as error:
         raise SideFileError(
             f"{path.name} cannot be read as a raster of heights: {plain(str(error), 200)}"
         ) from error

@@ -28,6 +28,7 @@ from skyquilt.planning.stops import flights_of
 from skyquilt.planning.terrain import FLAT, Terrain, read_terrain
 from skyquilt.planning.view import find_view, narrowest
 from skyquilt.raster.vector import lines, points
+from skyquilt.typed import typed
 
 FILES = ("plan.json", "points.geojson", "routes.geojson", "plan.kml", "plan.html")
 """Files of a plan, besides those of the drones."""
@@ -57,6 +58,9 @@ class Order:
     """fleet.toml."""
     base: Path | None = None
     """An old map under the plan's page."""
+
+    def __post_init__(self) -> None:
+        typed(self)
 
 
 def iter_plan(order: Order, output: Path, *, overwrite: bool = False) -> Iterator[Event]:

@@ -17,6 +17,18 @@ MAPS = (GEOTIFF, "MBTiles", "PNG", "JPEG", "JP2OpenJPEG", "WEBP", "BMP", "HFA", 
 """Formats of maps that users bring along."""
 
 
+def why_unreadable(error: Exception) -> str:
+    """What is wrong with a raster that could not be read, to be put after its name. GDAL's own
+    words name no cause ("Read failed. See previous exception for details.").
+    """
+    told = str(error)
+    if "not recognized" in told:
+        return "it is no raster, or its beginning is damaged"
+    if "No such file" in told:
+        return "it does not exist"
+    return "it is damaged, or a copy that was cut off"
+
+
 def open_raster(path: Path, **options: Any) -> "DatasetReader":
     """Opens a map that a user brings along, of whatever format in `MAPS`.
 

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 
 from skyquilt.errors import SideFileError
-from skyquilt.outside import plain
 from skyquilt.raster.colours import Palette, coloured
-from skyquilt.raster.drivers import open_raster
+from skyquilt.raster.drivers import open_raster, why_unreadable
 from skyquilt.raster.tile_store import LEVELS, SIDE, Address, TileStore
 
 if TYPE_CHECKING:
@@ -171,8 +170,12 @@ class FileSource:
     _known: dict[str, About] = field(default_factory=dict)
 
     @contextmanager
-    def _opened(self) -> "Iterator[DatasetReader]":
-        """The file; it may be damaged, or have been replaced since it was opened first."""
+    def opened(self) -> "Iterator[DatasetReader]":
+        """The file; it may be damaged, or have been replaced since it was opened first.
+
+        Raises:
+            SideFileError: it cannot be read.
+        """
         from rasterio.errors import RasterioError
 
         try:
@@ -180,7 +183,8 @@ class FileSource:
                 yield raster
         except (RasterioError, UnicodeDecodeError) as error:
             raise SideFileError(
-                f"{self.path.name} cannot be read as a map: {plain(str(error), 150)}"
+                f"{self.path.name} cannot be read as a map: {why_unreadable(error)}; copy it again,"
+                " or make it again"
             ) from error
 
     def about(self) -> About:
@@ -190,7 +194,7 @@ class FileSource:
             SideFileError: it cannot be read.
         """
         if not self._known:
-            with self._opened() as raster:
+            with self.opened() as raster:
                 bands = 3 if raster.count >= 3 else 1
                 system = raster.crs
                 units = tuple(u or "" for u in raster.units[:bands])
@@ -226,7 +230,7 @@ class FileSource:
         """
         from rasterio.windows import from_bounds
 
-        with self._opened() as raster:
+        with self.opened() as raster:
             left, top = raster.bounds.left, raster.bounds.top
             west, south, east, north = (
                 max(bounds[0], left),

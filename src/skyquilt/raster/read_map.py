@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.raster.drivers import open_raster
+from skyquilt.raster.drivers import open_raster, why_unreadable
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -103,7 +103,7 @@ def _read(
             )
             valid = raster.dataset_mask(window=window, out_shape=shape) > 0
     except rasterio.errors.RasterioError as error:
-        raise OSError(f"its pixels cannot be decoded ({error})") from error
+        raise OSError(f"its pixels cannot be decoded: {why_unreadable(error)}") from error
     pixels = np.moveaxis(values, 0, -1) if source.bands > 1 else values[0]
     if pixels.dtype.kind == "f":
         valid &= np.isfinite(pixels if pixels.ndim == 2 else pixels.sum(2))

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from skyquilt.alignment.outcome import UNDETERMINED
+from skyquilt.alignment.outcome import UNDETERMINED, UNSETTLED
 from skyquilt.report import headline
 from skyquilt.report.input import ReportInput
 from skyquilt.report.numbers import count, fixed, items, mapping, number, plain
@@ -23,12 +23,13 @@ def attention(data: ReportInput) -> tuple[Sentence, ...]:
     m = data.metrics
     return (
         *((plain(w), "") for w in items(m.get("warnings"))[:20]),
+        *((plain(w), "") for w in data.doubts[:20]),
         *_poor(data),
         *_overlap(data),
         *_seams(m),
         *_shutter(m),
         *_counts(m),
-        *_focal(m),
+        *(() if any(UNSETTLED in told for told in data.doubts) else _focal(m)),
         *_listed(m),
     )
 

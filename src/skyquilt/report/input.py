@@ -94,6 +94,8 @@ class ReportInput:
     """The content of metrics.json, with `control`, `cameras`, `notes`, `warnings` where there are
     any.
     """
+    doubts: Sequence[str] = ()
+    """What the alignment warned of; `notes` have it among others."""
     preview: NDArray[Any] | None = None
     """(H, W, 4) uint8 RGBA, north up: the mosaic, reduced."""
     bounds: Bounds | None = None

@@ -7,13 +7,13 @@ import json
 import math
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.sax.saxutils import escape
 
 import numpy as np
 
-from skyquilt.engine.folder import EXPORTS
+from skyquilt.engine.folder import EXPORTS, changed, make_folder
 from skyquilt.errors import SideFileError, UsageError
 from skyquilt.outside import plain, read_bounded
 from skyquilt.raster import CogWriter, RasterSpec
@@ -25,6 +25,7 @@ from skyquilt.runs.grid import ExportGrid, grid_of
 from skyquilt.runs.kmz import write_kmz
 from skyquilt.runs.layers import RunLayer, figures_of, layers_in, range_of, unit_of, vertical_of
 from skyquilt.runs.web_tiles import web_tiles, write_mbtiles_file
+from skyquilt.typed import typed
 
 WHAT = ("png", "kmz", "mbtiles", "tiles", "tif", "heights", "footprints")
 """What can be exported."""
@@ -58,6 +59,7 @@ class Wanted:
     """Size of a pixel in m; None = that of the map."""
 
     def __post_init__(self) -> None:
+        typed(self)
         unknown = [w for w in self.what if w not in WHAT]
         if unknown or not self.what:
             raise UsageError(
@@ -102,11 +104,14 @@ def export(folder: Path, wanted: Wanted, output: Path | None = None) -> Iterator
             f"the map is not georeferenced, which {', '.join(placed)} must be; png and tif need not"
         )
     target = output or folder / EXPORTS
-    with mended(target):
-        target.mkdir(parents=True, exist_ok=True)
+    make_folder(target)
+    other = changed(folder)
     for what in wanted.what:
-        name = "heights" if what == "heights" else wanted.layer
-        yield _one(what, folder, layers[name], wanted, target)
+        layer = layers["heights" if what == "heights" else wanted.layer]
+        done = _one(what, folder, layer, wanted, target)
+        source = "footprints.geojson" if what == "footprints" else layer.file
+        doubt = f"{source} is not as the run wrote it" if source in other else ""
+        yield replace(done, note="; ".join(n for n in (done.note, doubt) if n))
 
 
 def _one(what: str, folder: Path, layer: RunLayer, wanted: Wanted, target: Path) -> Export:

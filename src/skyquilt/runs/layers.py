@@ -76,9 +76,10 @@ def is_tiff(path: Path) -> bool:
 
 
 def layers_in(folder: Path) -> dict[str, RunLayer]:
-    """The layers that a run has, by name."""
+    """The layers that a run has, by name; a damaged surface model is not replaced by the ground."""
     found = {layer.name: layer for layer in LAYERS if is_tiff(folder / layer.file)}
-    if "heights" not in found and is_tiff(folder / FLAT.file):
+    named = {layer.name: layer.file for layer in LAYERS}
+    if not (folder / named["heights"]).exists() and is_tiff(folder / FLAT.file):
         found["heights"] = FLAT
     return {name: found[name] for name in (x.name for x in LAYERS) if name in found}
 

@@ -22,6 +22,7 @@ from skyquilt.photos.cameras_json import read_cameras_json
 from skyquilt.raster.map_source import FileSource
 from skyquilt.runs.layers import RunLayer, figures_of, layers_in, unit_of
 from skyquilt.runs.rasters import Raster, as_xarray, read_raster
+from skyquilt.typed import as_path
 
 if TYPE_CHECKING:
     import xarray
@@ -100,7 +101,7 @@ class Run:
         """Tie points and their observations, from the run's folder `.skyquilt`.
 
         Raises:
-            UsageError: that folder has been deleted.
+            UsageError: that folder has been deleted, or holds those of another map.
         """
         alignment, names = self._alignment()
         ties = alignment.ties
@@ -115,18 +116,31 @@ class Run:
     def _alignment(self) -> tuple[Alignment, dict[int, str]]:
         """The alignment as it was stored, and the names of its photos."""
         from skyquilt.workflows.artefacts import REGISTRY  # slow to load
+        from skyquilt.workflows.finished import NAME, STAGE
 
         store = Store(folder=self.path / STATE / "store", registry=REGISTRY)
-        kept = sorted((store.folder / "alignment").glob("*.npz"), key=lambda p: p.stat().st_mtime)
-        found = store.get("alignment", kept[-1].stem) if kept else None
-        if found is None:
+        made = store.get(STAGE, NAME)
+        found = None if made is None else store.get("alignment", made.alignment)
+        if made is None or found is None:
             raise UsageError(
                 f"{self.path} has no observations: they are in its folder {STATE}, which has been"
                 " deleted; make the map again"
             )
-        # the file lists its photos in the order of the alignment
-        shots = json.loads(read_bounded(self.path / "reconstruction.json"))[0]["shots"]
-        return found, dict(zip(sorted(found.poses), shots, strict=True))
+        names = dict(enumerate(made.names))
+        if not self._shows(found, names):
+            raise UsageError(
+                f"the observations in {self.path / STATE} are not those of the map, whose run may"
+                " have been interrupted; run the command that made it again"
+            )
+        return found, names
+
+    def _shows(self, alignment: Alignment, names: Mapping[int, str]) -> bool:
+        """Whether the files of the run have these poses."""
+        origin = np.array([*alignment.frame.origin, 0.0])
+        centres = {names[i]: p.map_C + origin for i, p in alignment.poses.items() if i in names}
+        return self.poses.keys() <= centres.keys() and all(
+            np.allclose(p.map_C, centres[n], rtol=0, atol=1e-3) for n, p in self.poses.items()
+        )
 
     @cached_property
     def layers(self) -> dict[str, RunLayer]:
@@ -195,7 +209,7 @@ def open_run(folder: Path | str) -> Run:
     Raises:
         UsageError: it holds no finished run.
     """
-    path = Path(folder)
+    path = as_path("folder", folder)
     metrics = figures_of(path)
     if not metrics or "mosaic" not in layers_in(path):
         raise UsageError(

@@ -1,5 +1,6 @@
 """Rasters of a run as arrays."""
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -7,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.errors import UsageError
-from skyquilt.raster.drivers import GEOTIFF
 from skyquilt.raster.map_source import Bounds, FileSource
+from skyquilt.typed import as_kind
 
 if TYPE_CHECKING:
     import xarray
@@ -48,13 +49,19 @@ def read_raster(
     """A part of a GeoTIFF; `bounds` and `gsd_m` None = the whole, as fine as the file.
 
     Raises:
-        UsageError: the part has no area, or lies outside.
+        UsageError: the part has no area, or lies outside; `gsd_m` is no size of a pixel.
+        SideFileError: the file is damaged.
     """
-    import rasterio
     from rasterio.enums import Resampling
     from rasterio.windows import Window
 
-    with rasterio.open(source.path, driver=GEOTIFF) as file:
+    bounds = as_kind("bounds", bounds, Bounds | None)
+    gsd_m = as_kind("gsd_m", gsd_m, float | None)
+    if bounds is not None and not all(map(math.isfinite, bounds)):
+        raise UsageError(f"bounds are {bounds}; west, south, east, north are finite numbers")
+    if gsd_m is not None and not 0 < gsd_m < math.inf:
+        raise UsageError(f"gsd_m is {gsd_m:g}; the size of a pixel in m is expected")
+    with source.opened() as file:
         own, left, top = file.res[0], file.bounds.left, file.bounds.top
         west, south, east, north = bounds or tuple(file.bounds)
         c0, c1 = (int(np.clip(round((v - left) / own), 0, file.width)) for v in (west, east))

@@ -40,6 +40,10 @@ def open_survey(
     if photos is not None and not photos.is_dir():
         raise UsageError(f"--photos {photos} is not a folder")
     if (folder / NAME).is_file():
+        if photos is not None:
+            raise UsageError(
+                f"--photos would have no effect: {folder} is a live survey, which holds its photos"
+            )
         return LiveSurvey(folder, base=base)
     if is_tiff(folder / "mosaic.tif"):
         return FinishedSurvey(folder, base=base, photos=photos)

@@ -32,12 +32,13 @@ from skyquilt.model.photo import Survey
 from skyquilt.model.registration import RefusedRegistration, Registration
 from skyquilt.ortho.radiometry import recorded_tags, value_figures
 from skyquilt.photos.together import taken_together
-from skyquilt.settings import MosaicSettings, PictureSettings
+from skyquilt.settings import DEFAULTS, MosaicSettings, PictureSettings
 from skyquilt.thermal.by_heights import finer
 from skyquilt.thermal.by_pairs import by_homographies, by_pairs
 from skyquilt.thermal.by_rig import draw_rigged, drift_of_rigged, rig_figures, rigged
 from skyquilt.thermal.page import write_figures, write_overlays, write_section
 from skyquilt.thermal.routes import ROUTES, Joined, as_registration, join, opened, refuse_apart
+from skyquilt.typed import as_path, instance
 from skyquilt.workflows.flow import Scene
 from skyquilt.workflows.mosaic import FinishedMap, make_map
 from skyquilt.workflows.survey_input import SurveyInput, read_input
@@ -62,7 +63,7 @@ def iter_thermal(
         RefusedError: the requested method is refused; both maps have been written by then.
         SkyquiltError: any other error that the user can correct.
     """
-    asked, output = settings or MosaicSettings(), Path(output)
+    asked, output = instance("settings", settings, MosaicSettings), as_path("output", output)
     settings, heated = _settings_of_both(asked)
     if route not in ROUTES:
         raise UsageError(f"--thermal-route {route!r} is not one of {', '.join(ROUTES)}")
@@ -124,19 +125,16 @@ def _settings_of_both(asked: MosaicSettings) -> tuple[MosaicSettings, MosaicSett
     only.
     """
     named = asked.input.sequence in ("time", "name")
-    heated = asked.changed(
-        thermal_unit=asked.input.thermal_unit or "auto",
-        gcp=None,
-        geo=None,
-        cameras=None,
-        distances=None,
-        sequence=asked.input.sequence if named else "time",
-        bounds=None,
-        boundary=None,
-        gsd_cm=None,
-        compress="auto",
+    own = (
+        *("gcp", "geo", "cameras", "distances", "bounds", "boundary", "gsd_cm", "compress"),
+        *("quality", "frame_overlap", "clock_offset", "write_frames"),
     )
-    return asked.changed(thermal_unit=None), heated
+    heated = asked.changed(
+        **{name: DEFAULTS[name] for name in own},
+        thermal_unit=asked.input.thermal_unit or "auto",
+        sequence=asked.input.sequence if named else "time",
+    )
+    return asked.changed(thermal_unit=None, balance_thermal=None), heated
 
 
 def _joined(

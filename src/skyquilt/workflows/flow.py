@@ -18,7 +18,8 @@ from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.late_positions import as_moved
 from skyquilt.alignment.oblique_guess import lowered
 from skyquilt.alignment.priors import choose_frame, priors
-from skyquilt.engine.clock import Clock, Steps
+from skyquilt.alignment.progress import AdjustmentSteps
+from skyquilt.engine.clock import Clock, Steps, apart
 from skyquilt.engine.free_memory import give_back_growth
 from skyquilt.engine.pixel_cache import PixelCache, pixel_budget, resident_budget
 from skyquilt.engine.store import Store
@@ -410,12 +411,14 @@ def _links(
 
 
 def _align(known: AlignmentInputs, key: str, methods: Methods, clock: Clock) -> Steps[Alignment]:
-    yield 0, 1
-    store = clock.store
-    resumable = replace(known, keep=store.parts(ADJUSTING, key, clock.workers))
-    alignment = store.get_or("alignment", key, lambda: methods.align(resumable))
+    store, keep = clock.store, clock.store.parts(ADJUSTING, key, clock.workers)
+
+    def aligned(tell: Callable[[str], None]) -> Alignment:
+        resumable = replace(known, keep=replace(keep, told=tell))
+        return store.get_or("alignment", key, lambda: methods.align(resumable))
+
+    alignment = yield from apart(aligned, AdjustmentSteps())
     store.forget([ADJUSTING])
-    yield 1, 1
     return alignment
 
 

@@ -18,6 +18,7 @@ from skyquilt.alignment.aligners import Auto, ByLinks, ByReport, by_pose
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.inputs import Aligner
 from skyquilt.alignment.pose import ByPosition
+from skyquilt.effects import FLIGHTLINE_FEATURES
 from skyquilt.engine.kept import Keep
 from skyquilt.imaging.nodes import View
 from skyquilt.matching.candidates import Nearest, Pair, Retrieval
@@ -166,10 +167,8 @@ class Methods:
 
 
 BLENDS: dict[str, type[Blend]] = {"first": First, "average": Average, "multiband": Multiband}
-FLIGHTLINE_FEATURES, FLIGHTLINE_PX = 4000, 1500
-"""Least number of features, and longest side of images in px, for which the thresholds of method
-`flightline` are defined.
-"""
+FLIGHTLINE_PX = 1500
+"""Longest side of images in px for which the thresholds of method `flightline` are defined."""
 
 
 def methods_for(settings: MosaicSettings) -> Methods:

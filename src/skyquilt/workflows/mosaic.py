@@ -40,6 +40,7 @@ from skyquilt.quality.run_metrics import figures
 from skyquilt.quality.seam_measurement import MeasuredSeams, measure_seams
 from skyquilt.quality.tone import tone_residual
 from skyquilt.settings import MosaicSettings
+from skyquilt.typed import as_path, instance
 from skyquilt.version import __version__
 from skyquilt.workflows.artefacts import ARTEFACTS, REGISTRY
 from skyquilt.workflows.clip_frames import frame_methods, write_frames
@@ -119,12 +120,13 @@ def iter_mosaic(
         SkyquiltError: any error that the user can correct: no photos, an output folder in use, a
             malformed side file ...
     """
-    settings, began = settings or MosaicSettings(), Clock.now()
-    files = ReadFiles(Store(folder=Path(output) / STATE / "store", registry=REGISTRY))
+    settings, began = instance("settings", settings, MosaicSettings), Clock.now()
+    output = as_path("output", output)
+    files = ReadFiles(Store(folder=output / STATE / "store", registry=REGISTRY))
     given = read_input(folder, settings.input, files)
     made = yield from make_map(
         given,
-        Path(output),
+        output,
         settings,
         methods,
         files,
@@ -178,7 +180,7 @@ def make_map(
     """
     return_large_blocks()
     began, methods = began or Clock.now(), methods or methods_for(settings)
-    check_input(given, output, settings)
+    given = check_input(given, output, settings)
     key, recipe = run_key(given, settings, methods), recipe_of(given, settings, methods)
     earlier = _earlier(given, output, recipe) if add else None
     again = rerun_from is not None
@@ -190,6 +192,12 @@ def make_map(
         yield Note(text=f"{run.path} already contains this mosaic; nothing to do")
         result = Result(output=run.path, metrics=former)
         return FinishedMap(result=result, given=given, methods=methods, settings=settings)
+    if changed := run.changed:
+        yield Note(
+            text=f"{', '.join(changed)} in {run.path} are not as the run wrote them, and are made"
+            " again",
+            warning=True,
+        )
     run.mark("running")
     if files is not None:
         files.keep(store)

@@ -121,6 +121,7 @@ def report_input(
     heights = np.where(number > 0, z, np.float32(np.nan))
     return ReportInput(
         metrics=metrics,
+        doubts=aligned.alignment.notes,
         preview=drawn.preview,
         bounds=drawn.preview_grid.bounds,
         origin=frame.origin,

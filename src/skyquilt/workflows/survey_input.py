@@ -1,10 +1,11 @@
 """Input of a run: metadata of photos, side files, control points, known distances."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from skyquilt.alignment.priors import choose_frame
+from skyquilt.effects import option_of
 from skyquilt.errors import PhotoFailedError, SkyquiltError, UsageError
 from skyquilt.model.clip import ChosenFrames
 from skyquilt.model.photo import (
@@ -24,10 +25,11 @@ from skyquilt.photos.read import ReadPhoto, read_photo
 from skyquilt.photos.sequence import sequence_of
 from skyquilt.photos.shutter import stated_shutter
 from skyquilt.photos.survey import read_survey
-from skyquilt.settings import InputSettings, MosaicSettings
+from skyquilt.settings import DEFAULTS, InputSettings, MosaicSettings
 
 Source = Path | Sequence[Path]
 """A folder of photos and clips, or such files."""
+TIFFS = (".tif", ".tiff")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -182,9 +184,9 @@ def completed(given: SurveyInput, settings: InputSettings) -> SurveyInput:
     )
 
 
-def check_input(given: SurveyInput, output: Path, settings: MosaicSettings) -> None:
+def check_input(given: SurveyInput, output: Path, settings: MosaicSettings) -> SurveyInput:
     """Checks that options and output folder suit the survey, before anything is computed or
-    replaced.
+    replaced. The survey has notes on options that have no effect on its photos.
 
     Raises:
         UsageError, SideFileError: they do not.
@@ -208,3 +210,21 @@ def check_input(given: SurveyInput, output: Path, settings: MosaicSettings) -> N
         from skyquilt.raster.boundary import read_boundary
 
         read_boundary(settings.picture.boundary, frame.crs)
+    notes = (*given.survey.notes, *_idle(given, settings))
+    return replace(given, survey=replace(given.survey, notes=notes))
+
+
+def _idle(given: SurveyInput, settings: MosaicSettings) -> Iterator[str]:
+    """Notes on options that have no effect on these photos."""
+    photos, asked = given.survey.photos, dict(settings)
+    clips = bool(given.survey.clips or given.clips)
+    single = any(p.channels == 1 and p.path.suffix.lower() in TIFFS for p in photos)
+    lossless = not clips and all(p.dtype != "uint8" for p in photos)
+    for names, some, why in (
+        (("frame_overlap", "clock_offset", "write_frames"), clips, "there is no video"),
+        (("thermal_unit",), single, "no photo is a TIFF of one band"),
+        (("balance_thermal",), any(p.unit for p in photos), "no photo has measured values"),
+        (("quality",), not lossless, "these photos are stored without loss"),
+    ):
+        given_up = [n for n in names if not some and asked[n] != DEFAULTS[n]]
+        yield from (f"--{option_of(name)} has no effect here: {why}." for name in given_up)
