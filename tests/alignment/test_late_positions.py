@@ -153,3 +153,29 @@ def test_a_flight_with_late_positions_is_placed_as_with_right_ones(seed):
     assert np.linalg.norm(off, axis=1).max() < 1.0
     assert sum("moved to the photos" in note for note in late.notes) == 1
     assert not any("moved to the photos" in note for note in right.notes)
+
+
+@pytest.mark.parametrize("late", [7, -7])
+@pytest.mark.parametrize("seed", range(4))
+def test_all_positions_late_by_many_photos_are_moved(late, seed):
+    """A clock that is off by half a minute: by more than parts of a survey are moved."""
+    true = told_at(LINES, 1.5, seed)
+    moved = unshifted(block(LINES), late_by(true, late), ["A"] * len(LINES))
+    inside = slice(None, -late) if late > 0 else slice(-late, None)
+    for a, b in zip(moved[inside], true[inside], strict=True):
+        assert np.array_equal(a.map_C, b.map_C)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_positions_in_reversed_order_are_moved_where_the_way_tells(seed):
+    """Along a road that bends after two thirds of the way; there and back it is a map turned by 180
+    degrees or mirrored, and nothing is moved.
+    """
+    road = np.array([(15.0 * min(k, 14), 15.0 * max(k - 14, 0), 60.0) for k in range(22)])
+    true = told_at(road, 1.5, seed)
+    moved = unshifted(block(road), true[::-1], ["A"] * len(road))
+    assert all(np.array_equal(a.map_C, b.map_C) for a, b in zip(moved, true, strict=True))
+    assert unshifted(block(road), true, ["A"] * len(road)) is true
+    for some in (LINES, LINES[:18]):
+        told = told_at(some, 1.5, seed)[::-1]
+        assert unshifted(block(some), told, ["A"] * len(some)) is told

@@ -54,8 +54,9 @@ def position_warnings(priors: Sequence[Prior], alignment: Alignment) -> list[str
     if _mirrored(found, told, sigma):
         return [
             "The reported positions are mirrored against the pictures: latitude and longitude are"
-            " exchanged, west is taken for east, or the pictures were mirrored. The map lies wrong;"
-            " correct the positions with a geo.txt, or give control points."
+            " exchanged, west is taken for east, their list has another order, or the pictures"
+            " were mirrored. The map lies wrong; correct the positions with a geo.txt, or give"
+            " control points."
         ]
     return [
         f"The reported positions contradict the pictures: half of the photos lie more than"

@@ -17,7 +17,11 @@ from skyquilt.model.poses import Alignment, Prior
 FEWEST, FEWEST_PART = 10, 8
 """Photos of a camera with positions that tell whether these are shifted, and of a part of them."""
 MOST = 6
-"""Positions are sought so many photos before and after at most."""
+"""Positions of a part are sought so many photos before and after at most;"""
+WHOLE_SHARE = 0.3
+"""those of all photos up to this share of them before and after, and in reversed order; as much of
+them may misfit.
+"""
 CLEARER = 0.5
 """Shifted, positions of a part misfit by less than this share of what they misfit by before, and of
 what the nearest other shifts leave, each with the place, direction and scale that fit best.
@@ -77,6 +81,8 @@ def _shifts(found: Alignment, priors: Sequence[Prior], own: Sequence[int]) -> Sh
     if not fits:
         return np.zeros(len(own), np.int64)
     usual = max(min(f[2] for f in fits.values()), 1e-3)
+    if (whole := _as_a_whole(placed, told, sigma)) is not None:
+        return whole
     best, least = np.zeros(len(own), np.int64), np.inf
     likely = sorted(fits, key=lambda s: (s != 0, fits[s][2]))[:4]  # as they are, and three others
     for g, c, _ in (fits[s] for s in likely):
@@ -85,6 +91,30 @@ def _shifts(found: Alignment, priors: Sequence[Prior], own: Sequence[int]) -> Sh
         if cost < least:
             best, least = path, cost
     return _clear(best, placed, told, sigma)
+
+
+def _as_a_whole(placed: Complex, told: Complex, sigma: Floats) -> Shifts | None:
+    """How many photos after each its position stands, where all are moved by the same number beyond
+    `MOST`, or are in reversed order, and nothing else explains them nearly as well; else None.
+    """
+    number = len(told)
+    reach = int(WHOLE_SHARE * number)
+    kept = number - reach
+    back, none = number - 1 - 2 * np.arange(number), np.zeros(number, np.int64)
+    tried = [
+        (np.full(number, s), _moved(told, s), _moved(sigma, s).real)
+        for s in range(-reach, reach + 1)
+    ]
+    tried += [(back, told[::-1], sigma[::-1]), (none, np.conj(told), sigma)]  # and mirrored
+    misfits = [_own_misfit(placed, t, d, kept) for _, t, d in tried]
+    least = min((m for m in misfits if m is not None), default=0.0)
+    likely = [k for k, m in enumerate(misfits) if m is not None and CLEARER * m <= least]
+    if len(likely) == 1:
+        found = tried[likely[0]][0]
+        return found if np.abs(found).max() > MOST else None
+    # there and back, reversed is mirrored, or a line late: a warning tells of positions
+    undecided = len(tried) - 2 in likely and reach not in likely
+    return none if undecided else None
 
 
 def _fit(
@@ -152,17 +182,20 @@ def _clear(path: Shifts, placed: Complex, told: Complex, sigma: Floats) -> Shift
     return out
 
 
-def _own_misfit(placed: Complex, told: Complex, sigma: Floats) -> float | None:
+def _own_misfit(
+    placed: Complex, told: Complex, sigma: Floats, kept: int | None = None
+) -> float | None:
     """Mean distance in m of a part's photos, brought to positions by a similarity of their own,
-    from these, of the three quarters that fit best; None where too few have both.
+    from these, of so many that fit best (three quarters of those that have both); None where too
+    few have both.
     """
     both = np.isfinite(placed) & np.isfinite(told)
-    if both.sum() < FEWEST_PART:
+    if both.sum() < (kept or FEWEST_PART):
         return None
     placed, told = placed[both], told[both]
     g, c, _ = fit_similarity(placed, told, sigma[both])
     off = np.sort(np.abs(g * placed + c - told))
-    return float(off[: -(-3 * len(off) // 4)].mean())
+    return float(off[: kept or -(-3 * len(off) // 4)].mean())
 
 
 def _at(prior: Prior, other: Prior | None) -> Prior:

@@ -344,6 +344,7 @@ def _exposure(
         settings=picture,
         keep=store.parts("balance", key),
         mixed=any(p.saved_grey for p in aligned.photos),
+        measured=first.channels != 3,  # one band may be temperatures, others are of several spectra
     )
     return store.get_or("balance", key, lambda: levelled(on))
 
