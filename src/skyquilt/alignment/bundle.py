@@ -29,7 +29,14 @@ from skyquilt.alignment.oblique_start import (
 from skyquilt.alignment.outcome import accuracy, ground_points, leave_one_out, misfits, undetermined
 from skyquilt.alignment.problem import Problem, State
 from skyquilt.alignment.setup import Setup, camera_records, pose_records, set_up
-from skyquilt.alignment.stages import believe_positions, fine_steps, plain, rough_steps, weighed
+from skyquilt.alignment.stages import (
+    believe_positions,
+    fine_steps,
+    plain,
+    rough_steps,
+    settled,
+    weighed,
+)
 from skyquilt.alignment.start import Start, find_start, ground_of
 from skyquilt.alignment.tracks import Thinning, Tracks, build_tracks, thin
 from skyquilt.alignment.triangulate import triangulated
@@ -80,7 +87,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 49
+    version: ClassVar[int] = 50
 
     def __call__(
         self,
@@ -276,8 +283,10 @@ class Bundle:
             problem, state = plain(problem, state, keep.within("plain"), near)
         setup = replace(setup, base=replace(setup.base, velocity=problem.velocity))
         if self.repair:
+            problem, state = settled(problem, state, setup)
             part = keep.within("positions")
             problem, state = believe_positions(problem, state, setup, part, near)
+            problem, state = settled(problem, state, setup)
         del step, near
         problem, state, frame, reports = hold_to_control(problem, state, frame, setup, control)
         make_room()

@@ -19,6 +19,8 @@ CONTRADICTED_DEVIATIONS = 5.0
 """
 CONTRADICTED_SHARE = 0.03
 """than this share of the flight's extent, where positions contradict the pictures."""
+LOOSE_DEG = 3.0
+"""A direction that rests on positions alone is told where its deviation is larger than this."""
 MIRRORED = 0.3
 """Positions are mirrored where their mirror image misfits by less than this share of their own
 misfit.
@@ -63,6 +65,41 @@ def position_warnings(priors: Sequence[Prior], alignment: Alignment) -> list[str
         f" {off:.0f} m from where they say, {usual:.2g} m are expected. Place, scale and direction"
         " of the map rest on them and are not reliable; correct the positions with a geo.txt, or"
         " give control points."
+    ]
+
+
+def direction_warnings(priors: Sequence[Prior], alignment: Alignment) -> list[str]:
+    """A sentence where no photo tells a heading and positions lie so close to one another, for
+    their errors, that they hardly tell the direction of the map: a hover, a climb, a few photos.
+
+    Positions err as they state, or as they are seen to, whichever is less.
+    """
+    held = [i for i in max(alignment.blocks, key=len, default=()) if i in alignment.poses]
+    told = [i for i in held if np.isfinite(priors[i].map_C[:2]).all()]
+    headed = any(np.isfinite(priors[i].yaw_deg) for i in held)
+    control = any(not c.check for c in alignment.control)
+    if alignment.frame.crs is None or len(told) < 2 or headed or control:
+        return []
+    placed, stated = (
+        _plane([p.map_C for p in some])
+        for some in ([alignment.poses[i] for i in told], [priors[i] for i in told])
+    )
+    sigma = np.array([priors[i].sigma_C[0] for i in told])
+    off = stated - placed - np.mean(stated - placed)
+    if len(told) >= FEWEST_POSITIONS:
+        seen = float(np.sqrt((np.abs(off) ** 2).sum() / (2 * len(told) - 4)))
+        sigma = np.minimum(sigma, max(seen, 1e-3))
+    reach = np.abs(placed - np.average(placed, weights=sigma**-2))
+    tells = float(((reach / sigma) ** 2).sum())
+    deviation = float(np.degrees(1 / np.sqrt(tells))) if tells > 0 else 180.0
+    if deviation <= LOOSE_DEG:
+        return []
+    usual = float(np.sqrt(np.mean(reach**2)))
+    return [
+        f"The direction of the map is uncertain: it may be turned by {min(2 * deviation, 180):.0f}"
+        f" degrees. No photo reports a heading, and positions that lie {usual:.2g} m from their"
+        f" middle and err by {np.median(sigma):.2g} m hardly tell it. Give camera angles or control"
+        " points."
     ]
 
 

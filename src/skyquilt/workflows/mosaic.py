@@ -15,7 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from skyquilt.alignment.conflicts import conflicts
-from skyquilt.alignment.contradicted_positions import enlargement_warnings, position_warnings
+from skyquilt.alignment.contradicted_positions import (
+    direction_warnings,
+    enlargement_warnings,
+    position_warnings,
+)
 from skyquilt.alignment.heights import height_figures
 from skyquilt.alignment.oblique_start import tilt_warnings
 from skyquilt.alignment.priors import stretch_warnings
@@ -387,6 +391,7 @@ def _metrics(
             warnings=[
                 *aligned.links.notes,
                 *position_warnings(aligned.priors, alignment),
+                *direction_warnings(aligned.priors, alignment),
                 *enlargement_warnings(aligned.priors, alignment),
                 *tilt_warnings(aligned.priors, alignment),
                 *stretch_warnings(alignment.frame),
