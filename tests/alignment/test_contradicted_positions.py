@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from skyquilt.alignment.contradicted_positions import (
-    direction_warnings,
     enlargement_warnings,
+    loose_warnings,
     position_warnings,
 )
 from tests.alignment.surveys import alignment, prior
@@ -112,10 +112,26 @@ def test_a_direction_that_positions_hardly_tell(reach, loose):
     turns = np.degrees(np.angle(((z + noise) * np.conj(z)).sum(1)))
     there = ring + np.column_stack([noise[0].real, noise[0].imag, np.zeros(12)])
     headless = [replace(p, yaw_deg=np.nan) for p in told_at(there, 2.0)]
-    said = direction_warnings(headless, block(ring))
+    said = loose_warnings(headless, block(ring))
     assert bool(said) == loose
     if loose:
         found = float(said[0].split("turned by ")[1].split()[0])
         assert found == pytest.approx(2 * turns.std(), rel=0.35)
-    assert direction_warnings(told_at(there, 2.0), block(ring)) == []
-    assert direction_warnings(headless, block(ring, crs=None)) == []
+    assert loose_warnings(told_at(there, 2.0), block(ring)) == []
+    assert loose_warnings(headless, block(ring, crs=None)) == []
+
+
+def test_a_scale_that_positions_hardly_tell_is_told_where_no_height_above_ground_does():
+    angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    ring = np.column_stack([3 * np.cos(angle), 3 * np.sin(angle), np.full(12, 50.0)])
+    there = ring + np.random.default_rng(0).normal(0, 2.0, ring.shape)
+    found = block(ring)
+    nowhere = replace(found, frame=replace(found.frame, vertical_datum="sea_level", takeoff_m=None))
+    (said,) = loose_warnings(told_at(there, 2.0), nowhere)
+    percent = float(said.split("small by ")[1].split()[0])
+    assert percent == pytest.approx(100 * 2 * 2.0 / np.sqrt(12 * 9), rel=0.35)
+    assert "turned" not in said and loose_warnings(told_at(there, 2.0), found) == []
+    climb = ring + np.column_stack([np.zeros((12, 2)), np.arange(0.0, 120, 10)])
+    above = block(climb)
+    above = replace(above, frame=nowhere.frame)
+    assert loose_warnings(told_at(climb + there - ring, 2.0), above) == []  # heights tell it

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.enlarged import heights_above_ground
 from skyquilt.alignment.similarity_graph import fit_similarity
+from skyquilt.alignment.start import ground_of
 from skyquilt.model.poses import Alignment, Prior
 
 FEWEST_POSITIONS = 6
@@ -19,8 +20,8 @@ CONTRADICTED_DEVIATIONS = 5.0
 """
 CONTRADICTED_SHARE = 0.03
 """than this share of the flight's extent, where positions contradict the pictures."""
-LOOSE_DEG = 3.0
-"""A direction that rests on positions alone is told where its deviation is larger than this."""
+LOOSE_DEG, LOOSE_SCALE = 3.0, 0.05
+"""Direction and scale that rest on positions alone are told where their deviations are larger."""
 MIRRORED = 0.3
 """Positions are mirrored where their mirror image misfits by less than this share of their own
 misfit.
@@ -68,38 +69,45 @@ def position_warnings(priors: Sequence[Prior], alignment: Alignment) -> list[str
     ]
 
 
-def direction_warnings(priors: Sequence[Prior], alignment: Alignment) -> list[str]:
-    """A sentence where no photo tells a heading and positions lie so close to one another, for
-    their errors, that they hardly tell the direction of the map: a hover, a climb, a few photos.
+def loose_warnings(priors: Sequence[Prior], alignment: Alignment) -> list[str]:
+    """A sentence where positions lie so close to one another, for their errors, that they hardly
+    tell the direction of the map, and no photo tells a heading; or hardly its scale, and no height
+    above ground is known: a hover, a climb, a few photos.
 
     Positions err as they state, or as they are seen to, whichever is less.
     """
     held = [i for i in max(alignment.blocks, key=len, default=()) if i in alignment.poses]
     told = [i for i in held if np.isfinite(priors[i].map_C[:2]).all()]
-    headed = any(np.isfinite(priors[i].yaw_deg) for i in held)
     control = any(not c.check for c in alignment.control)
-    if alignment.frame.crs is None or len(told) < 2 or headed or control:
+    if alignment.frame.crs is None or len(told) < 2 or control:
         return []
-    placed, stated = (
-        _plane([p.map_C for p in some])
-        for some in ([alignment.poses[i] for i in told], [priors[i] for i in told])
-    )
-    sigma = np.array([priors[i].sigma_C[0] for i in told])
-    off = stated - placed - np.mean(stated - placed)
+    C = np.array([alignment.poses[i].map_C for i in told])
+    off = np.array([priors[i].map_C for i in told]) - C
+    sigma = np.array([priors[i].sigma_C for i in told])
     if len(told) >= FEWEST_POSITIONS:
-        seen = float(np.sqrt((np.abs(off) ** 2).sum() / (2 * len(told) - 4)))
-        sigma = np.minimum(sigma, max(seen, 1e-3))
-    reach = np.abs(placed - np.average(placed, weights=sigma**-2))
-    tells = float(((reach / sigma) ** 2).sum())
-    deviation = float(np.degrees(1 / np.sqrt(tells))) if tells > 0 else 180.0
-    if deviation <= LOOSE_DEG:
+        off -= off.mean(0)
+        seen = np.sqrt((off**2).sum(0) / (len(told) - 2))
+        flat = float(np.sqrt((seen[:2] ** 2).mean()))
+        sigma = np.fmin(sigma, np.maximum([flat, flat, seen[2]], 1e-3))
+    reach = C - np.average(C, axis=0, weights=sigma[:, 0] ** -2)
+    tells = np.nan_to_num((reach / sigma) ** 2).sum(0)
+    turned = np.degrees(1 / np.sqrt(max(float(tells[:2].sum()), 1e-6)))
+    scaled = 1 / np.sqrt(max(float(tells.sum()), 1e-6))
+    says = []
+    if turned > LOOSE_DEG and not any(np.isfinite(priors[i].yaw_deg) for i in held):
+        says.append(f"be turned by {min(2 * turned, 180):.0f} degrees (no photo tells a heading)")
+    if scaled > LOOSE_SCALE and np.isnan(ground_of(alignment.frame)):
+        says.append(
+            f"be too large or small by {min(200 * scaled, 100):.0f} % (no height above take-off is"
+            " known)"
+        )
+    if not says:
         return []
-    usual = float(np.sqrt(np.mean(reach**2)))
+    usual = float(np.sqrt((reach[:, :2] ** 2).sum(1).mean()))
     return [
-        f"The direction of the map is uncertain: it may be turned by {min(2 * deviation, 180):.0f}"
-        f" degrees. No photo reports a heading, and positions that lie {usual:.2g} m from their"
-        f" middle and err by {np.median(sigma):.2g} m hardly tell it. Give camera angles or control"
-        " points."
+        f"The map may {' and '.join(says)}: positions lie {usual:.2g} m from their middle and err"
+        f" by {np.median(sigma[:, 0]):.2g} m, so they hardly tell it. Give camera angles and"
+        " heights, or control points."
     ]
 
 

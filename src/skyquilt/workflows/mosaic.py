@@ -16,8 +16,8 @@ from typing import Any
 
 from skyquilt.alignment.conflicts import conflicts
 from skyquilt.alignment.contradicted_positions import (
-    direction_warnings,
     enlargement_warnings,
+    loose_warnings,
     position_warnings,
 )
 from skyquilt.alignment.heights import height_figures
@@ -391,7 +391,7 @@ def _metrics(
             warnings=[
                 *aligned.links.notes,
                 *position_warnings(aligned.priors, alignment),
-                *direction_warnings(aligned.priors, alignment),
+                *loose_warnings(aligned.priors, alignment),
                 *enlargement_warnings(aligned.priors, alignment),
                 *tilt_warnings(aligned.priors, alignment),
                 *stretch_warnings(alignment.frame),
