@@ -14,7 +14,7 @@ from skyquilt.alignment.dominant_plane import levelled
 from skyquilt.alignment.enlarged import as_enlarged, enlarged_note, enlarged_photos, fits_better
 from skyquilt.alignment.equations import NearFactor
 from skyquilt.alignment.false_tilts import told_no_tilt
-from skyquilt.alignment.late_positions import moved_note, unshifted
+from skyquilt.alignment.late_positions import moved_note, on_time, unshifted
 from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
 from skyquilt.alignment.oblique import found_oblique, hung, reported_oblique, tilts_reported
 from skyquilt.alignment.oblique_guess import LOWERED, agrees, guessed_priors, lowered, misled
@@ -87,7 +87,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 50
+    version: ClassVar[int] = 51
 
     def __call__(
         self,
@@ -151,6 +151,12 @@ class Bundle:
             if off_positions(other, moved) < off_positions(found, priors):
                 said.append(moved_note(priors, moved))
                 found, priors, name = other, moved, "moved "
+        late = on_time(found, priors, photos) if self.repair else None
+        if late is not None:
+            other = block(aside, late.priors, "late ")
+            if off_positions(other, late.priors) < off_positions(found, priors):
+                said.append(late.note)
+                found, priors, name = other, late.priors, "late "
         if level := self.repair and not slanting(priors):
             loose, note = told_no_tilt(found, priors)
             other = block(aside, loose, "loose ") if note else found
