@@ -32,7 +32,10 @@ scale and no direction.
 """
 LOOSE_RAD = 0.15
 """Positions that tell the direction no better than this do not tell it where headings are reported,
-nor, as badly, the scale where heights above ground are known.
+nor, as badly, the scale where heights above ground are known;
+"""
+SCATTER = 6.0
+"""unless they lie further apart than so many deviations: then they are no errors of a receiver.
 """
 
 
@@ -165,6 +168,7 @@ def georeference(
     apart = height * np.abs(solution.t[known] - solution.t[known].mean())
     headed = any(np.isfinite(p.yaw_deg) for p in priors)
     loose = headed and float((apart**2).sum()) < (usual / LOOSE_RAD) ** 2
+    loose &= spread < SCATTER * usual + float(apart.max())
     turn = _turn(solution.a, priors) if headed else 1 + 0j
     if (
         known.sum() >= 2
