@@ -34,7 +34,7 @@ LOOSE_RAD = 0.15
 """Positions that tell the direction no better than this do not tell it where headings are reported,
 nor, as badly, the scale where heights above ground are known;
 """
-SCATTER = 6.0
+SCATTER = 10.0
 """unless they lie further apart than so many deviations: then they are no errors of a receiver.
 """
 
