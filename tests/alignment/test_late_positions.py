@@ -6,7 +6,8 @@ from datetime import datetime, timedelta
 import numpy as np
 import pytest
 
-from skyquilt.alignment.late_positions import as_on_time, on_time, unshifted
+from skyquilt.alignment.late_positions import as_moved, on_time, unshifted
+from skyquilt.alignment.motion import speeds_of
 from tests.alignment.surveys import alignment, photo, prior
 from tests.alignment.test_oblique_start import Slanting
 
@@ -210,7 +211,7 @@ def test_positions_of_another_moment_are_moved_along_the_flight(late_s, sigma, s
     photos, time = timed()
     told = told_at(of_another_moment(time, late_s), sigma, seed)
     found = block(LINES @ [[1.02, 0.03, 0], [-0.03, 1.02, 0], [0, 0, 1]])
-    moved = on_time(found, told, photos)
+    moved = on_time(found, told, ["cam"] * 24, speeds_of(photos))
     seconds = float(moved.note.split("moment ")[1].split()[0])
     assert seconds == pytest.approx(abs(late_s), abs=0.1 + 0.1 * abs(late_s))
     assert ("behind" in moved.note) == (late_s > 0)
@@ -220,8 +221,8 @@ def test_positions_of_another_moment_are_moved_along_the_flight(late_s, sigma, s
     before = np.linalg.norm((np.array([p.map_C for p in told]) - LINES)[:, :2], axis=1)
     assert known.sum() >= 16
     assert np.median(off) < 0.25 * np.median(before) + sigma
-    assert as_on_time(found, told, photos) is told
-    taken = as_on_time(replace(found, notes=(moved.note,)), told, photos)
+    assert as_moved(found, told, ["cam"] * 24, speeds_of(photos)) is told
+    taken = as_moved(replace(found, notes=(moved.note,)), told, ["cam"] * 24, speeds_of(photos))
     assert all(
         np.array_equal(a.map_C, b.map_C, equal_nan=True)
         for a, b in zip(taken, moved.priors, strict=True)
@@ -238,6 +239,17 @@ def test_noise_drift_and_offsets_across_the_flight_belong_to_no_other_moment(see
     antenna = 3.0 * back * [0.0, 1.0, 0.0] + 0.05 * noise  # to the side of a camera that turns
     gross = np.where(rng.uniform(size=(24, 1)) < 0.15, rng.normal(0, 40, LINES.shape), 0)
     for error in (noise, noise + drift, antenna, noise + gross):
-        assert on_time(block(LINES), told_at(LINES + error, 0.0, 0), photos) is None
+        assert (
+            on_time(block(LINES), told_at(LINES + error, 0.0, 0), ["cam"] * 24, speeds_of(photos))
+            is None
+        )
     still = [replace(p, time=None) for p in photos]
-    assert on_time(block(LINES), told_at(of_another_moment(time, 2.0), 0.1, 0), still) is None
+    assert (
+        on_time(
+            block(LINES),
+            told_at(of_another_moment(time, 2.0), 0.1, 0),
+            ["cam"] * 24,
+            speeds_of(still),
+        )
+        is None
+    )

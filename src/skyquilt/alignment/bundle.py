@@ -16,6 +16,7 @@ from skyquilt.alignment.equations import NearFactor
 from skyquilt.alignment.false_tilts import told_no_tilt
 from skyquilt.alignment.late_positions import moved_note, on_time, unshifted
 from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
+from skyquilt.alignment.motion import speeds_of
 from skyquilt.alignment.oblique import found_oblique, hung, reported_oblique, tilts_reported
 from skyquilt.alignment.oblique_guess import LOWERED, agrees, guessed_priors, lowered, misled
 from skyquilt.alignment.oblique_start import (
@@ -151,7 +152,7 @@ class Bundle:
             if off_positions(other, moved) < off_positions(found, priors):
                 said.append(moved_note(priors, moved))
                 found, priors, name = other, moved, "moved "
-        late = on_time(found, priors, photos) if self.repair else None
+        late = on_time(found, priors, cameras, speeds_of(photos)) if self.repair else None
         if late is not None:
             other = block(aside, late.priors, "late ")
             if off_positions(other, late.priors) < off_positions(found, priors):

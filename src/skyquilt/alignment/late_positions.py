@@ -11,9 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.motion import velocities
+from skyquilt.alignment.motion import Speeds
 from skyquilt.alignment.similarity_graph import fit_similarity
-from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, Prior
 
 FEWEST, FEWEST_PART = 10, 8
@@ -68,10 +67,17 @@ def unshifted(found: Alignment, priors: Sequence[Prior], cameras: Sequence[str])
     return out if any(a is not b for a, b in zip(out, priors, strict=True)) else priors
 
 
-def as_moved(found: Alignment, priors: Sequence[Prior], cameras: Sequence[str]) -> Sequence[Prior]:
-    """The priors as an alignment took them: moved where it says so."""
+def as_moved(
+    found: Alignment, priors: Sequence[Prior], cameras: Sequence[str], speeds: Speeds
+) -> Sequence[Prior]:
+    """The priors as an alignment took them: moved where it says so, to other photos or along the
+    flight.
+    """
     told = any(MOVED in note for note in found.notes)
-    return unshifted(found, priors, cameras) if told else priors
+    priors = unshifted(found, priors, cameras) if told else priors
+    late = any(LAGGED in note for note in found.notes)
+    moved = on_time(found, priors, cameras, speeds) if late else None
+    return priors if moved is None else moved.priors
 
 
 def moved_note(before: Sequence[Prior], after: Sequence[Prior]) -> str:
@@ -93,22 +99,24 @@ class Lagged:
     """What is said of them."""
 
 
-def on_time(found: Alignment, priors: Sequence[Prior], photos: Sequence[Photo]) -> Lagged | None:
+def on_time(
+    found: Alignment, priors: Sequence[Prior], cameras: Sequence[str], speeds: Speeds
+) -> Lagged | None:
     """The priors with positions moved to the moments at which photos were taken, where those of a
     camera's photos are of another moment, the same time before or after: a receiver that is late, a
-    clock that is off. None where none are.
+    clock that is off. None where none are. `cameras`: that of each photo.
 
     Along lines flown there and back such positions lie behind their photos, to one side and to the
     other: the map is stretched and turned.
     """
     out, said = list(priors), list[str]()
-    for camera in dict.fromkeys(p.camera_key for p in photos):
-        own = [i for i, p in enumerate(photos) if p.camera_key == camera and i in found.poses]
+    for camera in dict.fromkeys(cameras):
+        own = [i for i, c in enumerate(cameras) if c == camera and i in found.poses]
         own = [i for i in own if np.isfinite(priors[i].map_C[:2]).all()]
         if len(own) < FEWEST:
             continue
         C = np.array([found.poses[i].map_C for i in own])
-        v = _plane(velocities([photos[i] for i in own], C))
+        v = _plane(speeds(own, C))
         told = _plane(np.array([priors[i].map_C for i in own]))
         if (late := _lag(_plane(C), told, v)) is None:
             continue
@@ -124,15 +132,6 @@ def on_time(found: Alignment, priors: Sequence[Prior], photos: Sequence[Photo]) 
             " the clock or the receiver that they come from."
         )
     return Lagged(priors=tuple(out), note=" ".join(said)) if said else None
-
-
-def as_on_time(
-    found: Alignment, priors: Sequence[Prior], photos: Sequence[Photo]
-) -> Sequence[Prior]:
-    """The priors as an alignment took them: moved to the moments of photos where it says so."""
-    told = any(LAGGED in note for note in found.notes)
-    moved = on_time(found, priors, photos) if told else None
-    return priors if moved is None else moved.priors
 
 
 def _lag(

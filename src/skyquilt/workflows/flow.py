@@ -15,7 +15,8 @@ from typing import TypeVar
 from skyquilt.alignment.crowded_positions import believed
 from skyquilt.alignment.displaced_parts import as_taken
 from skyquilt.alignment.inputs import AlignmentInputs
-from skyquilt.alignment.late_positions import as_moved, as_on_time
+from skyquilt.alignment.late_positions import as_moved
+from skyquilt.alignment.motion import speeds_of
 from skyquilt.alignment.oblique_guess import lowered
 from skyquilt.alignment.priors import choose_frame, priors
 from skyquilt.engine.clock import Clock, Steps
@@ -222,8 +223,7 @@ def _trusted(
 ) -> tuple[Prior, ...]:
     """The reported priors as the alignment took them."""
     priors = lowered(alignment, believed(alignment, frame, reported))
-    priors = as_moved(alignment, priors, [p.camera_key for p in photos])
-    priors = as_on_time(alignment, priors, photos)
+    priors = as_moved(alignment, priors, [p.camera_key for p in photos], speeds_of(photos))
     return as_taken(alignment, [p.name for p in photos], priors)
 
 
