@@ -5,7 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skyquilt.alignment.contradicted_positions import enlargement_warnings, position_warnings
+from skyquilt.alignment.contradicted_positions import (
+    enlargement_warnings,
+    loose_warnings,
+    position_warnings,
+)
 from tests.alignment.surveys import alignment, prior
 
 LINES = np.array([(20.0 * (i % 5), 30.0 * (i // 5), 60.0) for i in range(20)])
@@ -94,3 +98,40 @@ def test_heights_that_are_told_drift_or_are_few_are_no_zoom():
     assert enlargement_warnings(told_at(wrong), block()) == []
     assert enlargement_warnings(told_at(two), block(two)) == []
     assert enlargement_warnings(told_at(LINES * (1, 1, np.nan)), block()) == []
+
+
+@pytest.mark.parametrize(("reach", "loose"), [(2.0, True), (8.0, True), (40.0, False)])
+def test_a_direction_that_positions_hardly_tell(reach, loose):
+    """Rings of twelve photos without headings: what is said is twice the scatter of directions
+    that fit noisy positions best.
+    """
+    angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    ring = np.column_stack([reach * np.cos(angle), reach * np.sin(angle), np.full(12, 50.0)])
+    noise = np.random.default_rng(0).normal(0, 2.0, (300, 12, 2)) @ (1, 1j)
+    z = ring[:, 0] + 1j * ring[:, 1]
+    turns = np.degrees(np.angle(((z + noise) * np.conj(z)).sum(1)))
+    there = ring + np.column_stack([noise[0].real, noise[0].imag, np.zeros(12)])
+    headless = [replace(p, yaw_deg=np.nan) for p in told_at(there, 2.0)]
+    said = loose_warnings(headless, block(ring))
+    assert bool(said) == loose
+    if loose:
+        found = float(said[0].split("turned by ")[1].split()[0])
+        assert found == pytest.approx(2 * turns.std(), rel=0.35)
+    assert loose_warnings(told_at(there, 2.0), block(ring)) == []
+    assert loose_warnings(headless, block(ring, crs=None)) == []
+
+
+def test_a_scale_that_positions_hardly_tell_is_told_where_no_height_above_ground_does():
+    angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    ring = np.column_stack([3 * np.cos(angle), 3 * np.sin(angle), np.full(12, 50.0)])
+    there = ring + np.random.default_rng(0).normal(0, 2.0, ring.shape)
+    found = block(ring)
+    nowhere = replace(found, frame=replace(found.frame, vertical_datum="sea_level", takeoff_m=None))
+    (said,) = loose_warnings(told_at(there, 2.0), nowhere)
+    percent = float(said.split("small by ")[1].split()[0])
+    assert percent == pytest.approx(100 * 2 * 2.0 / np.sqrt(12 * 9), rel=0.35)
+    assert "turned" not in said and loose_warnings(told_at(there, 2.0), found) == []
+    climb = ring + np.column_stack([np.zeros((12, 2)), np.arange(0.0, 120, 10)])
+    above = block(climb)
+    above = replace(above, frame=nowhere.frame)
+    assert loose_warnings(told_at(climb + there - ring, 2.0), above) == []  # heights tell it

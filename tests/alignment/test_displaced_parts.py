@@ -80,3 +80,27 @@ def test_what_is_small_beside_the_deviations_is_left_alone():
 def test_photos_in_one_place_tell_nothing():
     true = np.zeros((14, 3)) + (3.0, 4.0, 60.0)
     assert brought_together(*survey(true, true.copy(), 1.5)) is None
+
+
+@pytest.mark.parametrize("count", [24, 36, 150])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_flight_between_two_others_is_brought_to_them(count, seed):
+    """One division alone hardly makes positions fit better."""
+    rng = np.random.default_rng(seed)
+    true = lines(count)
+    told = true + rng.normal(0, 0.3, true.shape)
+    begins, ends = count // 3 + 1, 2 * count // 3
+    told[begins:ends, :2] += (4.0, 3.0)
+    moved = brought_together(*survey(true, told, 1.5))
+    assert f"from {begins:03d}.jpg and from " in moved.note
+    off = np.array([p.map_C[:2] for p in moved.priors]) - true[:, :2]
+    assert np.abs(off[begins:ends].mean(0) - off[:begins].mean(0)).max() < 0.5
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_positions_in_a_false_order_are_no_displaced_parts(seed):
+    """Lines that are displaced each by itself would explain them."""
+    true = lines(40, per_line=10)
+    told = true + np.random.default_rng(seed).normal(0, 1.5, true.shape)
+    for false in (told[::-1], np.roll(told, 10, axis=0), np.roll(told, -8, axis=0)):
+        assert brought_together(*survey(true, false, 5.0)) is None

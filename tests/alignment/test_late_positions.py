@@ -1,12 +1,14 @@
 """Positions of photos before or after are moved to where they belong, and no others are."""
 
 from dataclasses import replace
+from datetime import datetime, timedelta
 
 import numpy as np
 import pytest
 
-from skyquilt.alignment.late_positions import unshifted
-from tests.alignment.surveys import alignment, prior
+from skyquilt.alignment.late_positions import as_moved, on_time, unshifted
+from skyquilt.alignment.motion import speeds_of
+from tests.alignment.surveys import alignment, photo, prior
 from tests.alignment.test_oblique_start import Slanting
 
 LINES = np.array(
@@ -153,3 +155,101 @@ def test_a_flight_with_late_positions_is_placed_as_with_right_ones(seed):
     assert np.linalg.norm(off, axis=1).max() < 1.0
     assert sum("moved to the photos" in note for note in late.notes) == 1
     assert not any("moved to the photos" in note for note in right.notes)
+
+
+@pytest.mark.parametrize("late", [7, -7])
+@pytest.mark.parametrize("seed", range(4))
+def test_all_positions_late_by_many_photos_are_moved(late, seed):
+    """A clock that is off by half a minute: by more than parts of a survey are moved."""
+    true = told_at(LINES, 1.5, seed)
+    moved = unshifted(block(LINES), late_by(true, late), ["A"] * len(LINES))
+    inside = slice(None, -late) if late > 0 else slice(-late, None)
+    for a, b in zip(moved[inside], true[inside], strict=True):
+        assert np.array_equal(a.map_C, b.map_C)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_positions_in_reversed_order_are_moved_where_the_way_tells(seed):
+    """Along a road that bends after two thirds of the way; there and back it is a map turned by 180
+    degrees or mirrored, and nothing is moved.
+    """
+    road = np.array([(15.0 * min(k, 14), 15.0 * max(k - 14, 0), 60.0) for k in range(22)])
+    true = told_at(road, 1.5, seed)
+    moved = unshifted(block(road), true[::-1], ["A"] * len(road))
+    assert all(np.array_equal(a.map_C, b.map_C) for a, b in zip(moved, true, strict=True))
+    assert unshifted(block(road), true, ["A"] * len(road)) is true
+    for some in (LINES, LINES[:18]):
+        told = told_at(some, 1.5, seed)[::-1]
+        assert unshifted(block(some), told, ["A"] * len(some)) is told
+
+
+SPEED_MS, TURN_S = 6.0, 8.0
+
+
+def timed():
+    """The photos of `LINES`, flown at 6 m/s with 8 s from line to line, and times in s."""
+    step = np.hypot(*np.diff(LINES[:, :2], axis=0).T)
+    gap = np.where(step > 20, TURN_S, step / SPEED_MS)
+    time = np.concatenate([[0.0], np.cumsum(gap)])
+    began = datetime(2024, 5, 1)
+    named = [photo(f"{t:07.2f}.jpg") for t in time]
+    after = [began + timedelta(seconds=float(t)) for t in time]
+    return [replace(p, time=t) for p, t in zip(named, after, strict=True)], time
+
+
+def of_another_moment(time, late_s):
+    """The way flown, `late_s` before."""
+    there = [np.interp(time - late_s, time, LINES[:, axis]) for axis in range(3)]
+    return np.column_stack(there)
+
+
+@pytest.mark.parametrize("late_s", [1.0, 1.6, 4.0, -1.2])
+@pytest.mark.parametrize("sigma", [0.05, 1.0])
+@pytest.mark.parametrize("seed", range(4))
+def test_positions_of_another_moment_are_moved_along_the_flight(late_s, sigma, seed):
+    """The block is turned and stretched as such positions would have it: that changes nothing."""
+    photos, time = timed()
+    told = told_at(of_another_moment(time, late_s), sigma, seed)
+    found = block(LINES @ [[1.02, 0.03, 0], [-0.03, 1.02, 0], [0, 0, 1]])
+    moved = on_time(found, told, ["cam"] * 24, speeds_of(photos))
+    seconds = float(moved.note.split("moment ")[1].split()[0])
+    assert seconds == pytest.approx(abs(late_s), abs=0.1 + 0.1 * abs(late_s))
+    assert ("behind" in moved.note) == (late_s > 0)
+    C = np.array([p.map_C for p in moved.priors])
+    known = np.isfinite(C[:, 0])
+    off = np.linalg.norm((C - LINES)[known, :2], axis=1)
+    before = np.linalg.norm((np.array([p.map_C for p in told]) - LINES)[:, :2], axis=1)
+    assert known.sum() >= 16
+    assert np.median(off) < 0.25 * np.median(before) + sigma
+    assert as_moved(found, told, ["cam"] * 24, speeds_of(photos)) is told
+    taken = as_moved(replace(found, notes=(moved.note,)), told, ["cam"] * 24, speeds_of(photos))
+    assert all(
+        np.array_equal(a.map_C, b.map_C, equal_nan=True)
+        for a, b in zip(taken, moved.priors, strict=True)
+    )
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_noise_drift_and_offsets_across_the_flight_belong_to_no_other_moment(seed):
+    photos, time = timed()
+    rng = np.random.default_rng(seed)
+    noise = rng.normal(0, 1.5, LINES.shape)
+    drift = np.cumsum(rng.normal(0, 0.5, LINES.shape), axis=0)
+    back = np.repeat([1, -1, 1, -1], 6)[:, None]
+    antenna = 3.0 * back * [0.0, 1.0, 0.0] + 0.05 * noise  # to the side of a camera that turns
+    gross = np.where(rng.uniform(size=(24, 1)) < 0.15, rng.normal(0, 40, LINES.shape), 0)
+    for error in (noise, noise + drift, antenna, noise + gross):
+        assert (
+            on_time(block(LINES), told_at(LINES + error, 0.0, 0), ["cam"] * 24, speeds_of(photos))
+            is None
+        )
+    still = [replace(p, time=None) for p in photos]
+    assert (
+        on_time(
+            block(LINES),
+            told_at(of_another_moment(time, 2.0), 0.1, 0),
+            ["cam"] * 24,
+            speeds_of(still),
+        )
+        is None
+    )

@@ -217,6 +217,23 @@ def test_half_turn_lies_of_the_yaw_do_not_turn_the_block():
     assert np.median(np.abs(found.a)) == pytest.approx(60.0, rel=1e-5)
 
 
+@pytest.mark.parametrize("z", [60.0, np.nan])
+@pytest.mark.parametrize("seed", range(6))
+def test_headings_direct_photos_whose_positions_differ_by_their_errors_only(seed, z):
+    """A hover: the positions of 24 photos within 2 m tell a direction by chance, and headings that
+    differ from it were taken for lies.
+    """
+    a, t, links, solution = solved(seed)
+    hover = replace(solution, t=0.02 * solution.t)
+    rng = np.random.default_rng(seed)
+    position = 0.02 * t + rng.normal(0, 3.0, len(t)) + 1j * rng.normal(0, 3.0, len(t))
+    priors = priors_at(position, yaw=-np.degrees(np.angle(a)), z=z)
+    found, _, _ = georeference(hover, links, priors)
+    assert np.degrees(np.abs(np.angle(found.a / a))).max() < 3
+    if np.isfinite(z):
+        assert np.median(np.abs(found.a)) == pytest.approx(60.0, rel=0.05)
+
+
 def test_no_positions_and_no_height_is_not_metric():
     a, _, links, solution = solved(7)
     found, spread, metric = georeference(solution, links, priors_at(np.full(len(a), np.nan)))

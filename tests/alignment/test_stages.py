@@ -3,13 +3,15 @@
 import tracemalloc
 import weakref
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from skyquilt.alignment import equations, stages
 from skyquilt.alignment.deviations import observed_noise, robust_scale
-from skyquilt.alignment.robust import robust_cost
+from skyquilt.alignment.robust import observed_cost, robust_cost
 from skyquilt.engine.kept import Keep
 from tests.alignment.blocks import make_block
 
@@ -56,6 +58,45 @@ def test_photos_that_stand_for_all_are_of_each_camera(monkeypatch):
         apart = np.linalg.norm(block.start.C[chosen, None, :2] - block.start.C[chosen, :2], axis=2)
         near = np.sort(apart + np.eye(len(apart)) * 1e9, axis=1)[:, 0]
         assert near.max() < 40 and apart.max() > 60
+
+
+@pytest.mark.parametrize("sigma", [0.05, 2.0, 5.0])
+@pytest.mark.parametrize("headed", [False, True])
+def test_a_block_is_moved_turned_and_enlarged_as_a_whole(sigma, headed):
+    """What observations do not tell is undone, and their residuals stay; a block that lies well
+    stays as it is.
+    """
+    block = make_block(1, lines=4, per_line=6, points=200)
+    truth, count = block.truth, len(block.truth.C)
+    spread = np.full((count, 3), np.radians([6.0, 6.0, 2.0 if headed else 90.0]))
+    noise = np.random.default_rng(0).normal(0, 0.3 * sigma, (count, 3))
+    problem = replace(
+        block.problem,
+        C0=truth.C + noise,
+        sigma_C=np.full((count, 3), sigma),
+        R0=truth.R,
+        sigma_R=spread,
+    )
+    setup = SimpleNamespace(block_rows=(np.arange(count),))
+    turn = Rotation.from_euler("zyx", [0.0 if headed else 25.0, 2.0, -3.0], degrees=True)
+    turn = turn.as_matrix()
+    away = replace(
+        truth,
+        R=truth.R @ turn.T,
+        C=0.7 * (truth.C - (3, 4, 5)) @ turn.T,
+        X=0.7 * (truth.X - (3, 4, 5)) @ turn.T,
+    )
+    there, found = stages.settled(problem, away, setup)
+    apart = found.C - truth.C
+    off = np.linalg.norm(apart - apart.mean(0), axis=1).max()
+    assert off < 0.3 * sigma + 0.01 and np.abs(apart.mean(0)).max() < 0.3 * sigma
+    turned = Rotation.from_matrix(found.R @ np.swapaxes(truth.R, 1, 2)).magnitude()
+    assert np.degrees(turned).max() < 0.5 * sigma + 0.1
+    assert observed_cost(there, found) == pytest.approx(observed_cost(problem, away), rel=1e-6)
+    again = stages.settled(there, found, setup)
+    assert again[0] is there and again[1] is found
+    known = replace(problem, X0=truth.X)
+    assert stages.settled(known, away, setup)[1] is away  # control points hold it
 
 
 def test_short_numbers_change_nothing():

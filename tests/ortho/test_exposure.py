@@ -1,6 +1,7 @@
 """Gains of known size are found again; black and white stay; two gains are one."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -23,7 +24,9 @@ from skyquilt.ortho.exposure import (
     odds_table,
     with_odds,
 )
+from skyquilt.ortho.radiometry import Levelling
 from skyquilt.quality.tone import tone_residual
+from skyquilt.settings import PictureSettings
 from tests.ortho.scenes import FLAT, GRID, block, composer, photograph
 
 gains = st.floats(-1.5, 1.5)
@@ -164,6 +167,35 @@ def test_the_map_loses_its_patches(lit):
 
     before, after = spread(NEUTRAL), spread(Balance()(views, pictures, FLAT, GRID.bounds))
     assert before > 5 and after < 0.12 * before
+
+
+@pytest.mark.parametrize("bits", [10, 12, 14, 16])
+def test_photos_of_more_bits_are_balanced_as_those_of_eight(lit, bits):
+    """The same pictures with more bits get the same gains and the same map, but for rounding; the
+    lightest values tell how many of the 16 bits are used.
+    """
+    views, eight, _ = lit
+    step = (2**bits - 1) / 255
+    deep = {k: np.rint(p * step).astype(np.uint16) for k, p in eight.items()}
+    ground = SimpleNamespace(views=views, surface=FLAT, grid=GRID, growth=None)
+    common = {"balance": Balance(), "drift": None, "settings": PictureSettings(), "unit": ""}
+    of_eight = Levelling(dtype="uint8", thumbnails=eight, **common)(ground)
+    levelled = Levelling(dtype="uint16", thumbnails=deep, **common)
+    found = levelled(ground)
+    assert found.level == pytest.approx(step)
+    for k, gain in of_eight.gains.items():
+        assert found.gains[k] == pytest.approx(gain, abs=0.01)
+    whole = Window(row=0, column=0, height=GRID.height, width=GRID.width)
+    a, b = (
+        composer(views, p, GRID, bands=3, exposure=e, dtype=t)(whole).pixels
+        for p, e, t in ((eight, of_eight, np.uint8), (deep, found, np.uint16))
+    )
+    assert b.dtype == np.uint16 and np.abs(b / step - a).max() < 2
+    tones = [
+        tone_residual(views, p, FLAT, GRID.bounds, e) for p, e in ((eight, of_eight), (deep, found))
+    ]
+    assert tones[1]["median"] == pytest.approx(tones[0]["median"], rel=0.1)
+    assert replace(levelled, measured=True)(ground) is NEUTRAL
 
 
 def test_vignetting_is_found_by_camera(lit):

@@ -121,6 +121,16 @@ def test_a_repeated_position_is_as_uncertain_as_the_way_to_the_next(make_jpeg):
     assert any("8 photos" in n and "repeat" in n for n in survey.notes)
 
 
+def test_positions_of_a_receiver_that_stopped_are_as_uncertain_as_the_way_flown_since(make_jpeg):
+    """Nine photos after the last new position, at the usual steps: a bent map rested on them."""
+    places = [46.6 + 0.0001 * min(i, 5) for i in range(15)]
+    for i, latitude in enumerate(places):
+        folder = photo_at(make_jpeg, i, latitude, 14.3, drone=True)
+    found = [p.position.sigma_xy_m for p in read_survey(folder).photos]
+    assert found[:6] == [found[0]] * 6
+    assert found[6:] == pytest.approx([9 * 0.0001 * 111_320] * 9, rel=1e-3)
+
+
 def test_a_missing_reference_of_a_position_is_told(make_jpeg):
     exif = dji_exif()
     told = read_photo(make_jpeg("told.jpg", exif=exif))

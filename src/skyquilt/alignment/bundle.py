@@ -13,6 +13,7 @@ from skyquilt.alignment.dominant_plane import levelled
 from skyquilt.alignment.enlarged import as_enlarged
 from skyquilt.alignment.equations import NearFactor
 from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
+from skyquilt.alignment.motion import speeds_of
 from skyquilt.alignment.oblique import found_oblique, hung, tilts_reported
 from skyquilt.alignment.oblique_guess import LOWERED, guessed_priors, lowered
 from skyquilt.alignment.oblique_start import reported_start, slanting
@@ -20,7 +21,14 @@ from skyquilt.alignment.outcome import accuracy, ground_points, leave_one_out, m
 from skyquilt.alignment.problem import Problem, State
 from skyquilt.alignment.repairs import Beginning, Survey, begun_with, repaired
 from skyquilt.alignment.setup import Setup, camera_records, pose_records, set_up
-from skyquilt.alignment.stages import believe_positions, fine_steps, plain, rough_steps, weighed
+from skyquilt.alignment.stages import (
+    believe_positions,
+    fine_steps,
+    plain,
+    rough_steps,
+    settled,
+    weighed,
+)
 from skyquilt.alignment.start import Start, find_start, ground_of
 from skyquilt.alignment.tracks import Thinning, Tracks, build_tracks, thin
 from skyquilt.alignment.triangulate import triangulated
@@ -63,7 +71,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 48
+    version: ClassVar[int] = 51
 
     def __call__(
         self,
@@ -107,6 +115,7 @@ class Bundle:
         survey = Survey(
             names=[p.name for p in photos],
             cameras=[p.camera_key for p in photos],
+            speeds=speeds_of(photos),
             linked=len({i for k in links for i in (k.a, k.b)}),
             adjust=adjust,
             guess=guess,
@@ -219,8 +228,10 @@ class Bundle:
             problem, state = plain(problem, state, keep.within("plain"), near)
         setup = replace(setup, base=replace(setup.base, velocity=problem.velocity))
         if self.repair:
+            problem, state = settled(problem, state, setup)
             part = keep.within("positions")
             problem, state = believe_positions(problem, state, setup, part, near)
+            problem, state = settled(problem, state, setup)
         del step, near
         problem, state, frame, reports = hold_to_control(problem, state, frame, setup, control)
         make_room()

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.enlarged import heights_above_ground
 from skyquilt.alignment.similarity_graph import fit_similarity
+from skyquilt.alignment.start import ground_of
 from skyquilt.model.poses import Alignment, Prior
 
 FEWEST_POSITIONS = 6
@@ -19,6 +20,8 @@ CONTRADICTED_DEVIATIONS = 5.0
 """
 CONTRADICTED_SHARE = 0.03
 """than this share of the flight's extent, where positions contradict the pictures."""
+LOOSE_DEG, LOOSE_SCALE = 3.0, 0.05
+"""Direction and scale that rest on positions alone are told where their deviations are larger."""
 MIRRORED = 0.3
 """Positions are mirrored where their mirror image misfits by less than this share of their own
 misfit.
@@ -33,6 +36,12 @@ ALIKE = 0.1
 """Compared are photos that report the same height within this share of it: between others, a false
 focal length alone makes such factors.
 """
+
+
+def contradictions(priors: Sequence[Prior], alignment: Alignment) -> list[str]:
+    """All sentences of this module."""
+    asked = (position_warnings, loose_warnings, enlargement_warnings)
+    return [sentence for warnings in asked for sentence in warnings(priors, alignment)]
 
 
 def position_warnings(priors: Sequence[Prior], alignment: Alignment) -> list[str]:
@@ -54,14 +63,57 @@ def position_warnings(priors: Sequence[Prior], alignment: Alignment) -> list[str
     if _mirrored(found, told, sigma):
         return [
             "The reported positions are mirrored against the pictures: latitude and longitude are"
-            " exchanged, west is taken for east, or the pictures were mirrored. The map lies wrong;"
-            " correct the positions with a geo.txt, or give control points."
+            " exchanged, west is taken for east, their list has another order, or the pictures"
+            " were mirrored. The map lies wrong; correct the positions with a geo.txt, or give"
+            " control points."
         ]
     return [
         f"The reported positions contradict the pictures: half of the photos lie more than"
         f" {off:.0f} m from where they say, {usual:.2g} m are expected. Place, scale and direction"
         " of the map rest on them and are not reliable; correct the positions with a geo.txt, or"
         " give control points."
+    ]
+
+
+def loose_warnings(priors: Sequence[Prior], alignment: Alignment) -> list[str]:
+    """A sentence where positions lie so close to one another, for their errors, that they hardly
+    tell the direction of the map, and no photo tells a heading; or hardly its scale, and no height
+    above ground is known: a hover, a climb, a few photos.
+
+    Positions err as they state, or as they are seen to, whichever is less.
+    """
+    held = [i for i in max(alignment.blocks, key=len, default=()) if i in alignment.poses]
+    told = [i for i in held if np.isfinite(priors[i].map_C[:2]).all()]
+    control = any(not c.check for c in alignment.control)
+    if alignment.frame.crs is None or len(told) < 2 or control:
+        return []
+    C = np.array([alignment.poses[i].map_C for i in told])
+    off = np.array([priors[i].map_C for i in told]) - C
+    sigma = np.array([priors[i].sigma_C for i in told])
+    if len(told) >= FEWEST_POSITIONS:
+        off -= off.mean(0)
+        seen = np.sqrt((off**2).sum(0) / (len(told) - 2))
+        flat = float(np.sqrt((seen[:2] ** 2).mean()))
+        sigma = np.fmin(sigma, np.maximum([flat, flat, seen[2]], 1e-3))
+    reach = C - np.average(C, axis=0, weights=sigma[:, 0] ** -2)
+    tells = np.nan_to_num((reach / sigma) ** 2).sum(0)
+    turned = np.degrees(1 / np.sqrt(max(float(tells[:2].sum()), 1e-6)))
+    scaled = 1 / np.sqrt(max(float(tells.sum()), 1e-6))
+    says = []
+    if turned > LOOSE_DEG and not any(np.isfinite(priors[i].yaw_deg) for i in held):
+        says.append(f"be turned by {min(2 * turned, 180):.0f} degrees (no photo tells a heading)")
+    if scaled > LOOSE_SCALE and np.isnan(ground_of(alignment.frame)):
+        says.append(
+            f"be too large or small by {min(200 * scaled, 100):.0f} % (no height above take-off is"
+            " known)"
+        )
+    if not says:
+        return []
+    usual = float(np.sqrt((reach[:, :2] ** 2).sum(1).mean()))
+    return [
+        f"The map may {' and '.join(says)}: positions lie {usual:.2g} m from their middle and err"
+        f" by {np.median(sigma[:, 0]):.2g} m, so they hardly tell it. Give camera angles and"
+        " heights, or control points."
     ]
 
 

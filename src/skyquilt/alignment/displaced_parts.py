@@ -7,6 +7,7 @@ flights beside each other stretch or shrink the map by the difference.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +25,19 @@ they fall to a half at most.
 MOST_PARTS = 8
 """Parts into which a survey is divided at most."""
 LOOKED_AT = 60
-"""So many places of a large survey are tried for where a part begins, then those by the best."""
+"""So many places of a large survey are tried for where a part begins, then those by the best;"""
+MIDDLES = 16
+"""and so many for the begin and the end of a part between two others."""
 TOLD_APART = 0.5
 """Displacements below this share of the positions' deviations are left alone."""
+EXPLAINED, OF_THESE = 2.5, 0.15
+"""Displacements explain positions that then misfit (median) by less than this times what they
+state, or this share of the displacement: positions in a false order misfit by more.
+"""
+MOST_APART_M = 40.0
+"""Receivers err by metres: by more than this, positions are wrong in another way, and positions of
+lines in another order can be divided so that they fit.
+"""
 TRUSTED = 0.8
 """Share of the positions that are compared, those that fit best: others may be gross errors."""
 
@@ -60,7 +71,11 @@ def brought_together(
     shift = _shifts(placed, told, part)
     sigma = np.array([float(priors[i].sigma_C[0]) for i in own])
     apart = float(np.abs(np.diff(shift)).max(initial=0.0))
-    if not apart > TOLD_APART * float(np.median(sigma)):
+    usual = float(np.median(sigma))
+    left = told - _turn(placed, told, part) * placed - shift[part]
+    if not TOLD_APART * usual < apart < MOST_APART_M:
+        return None
+    if float(np.median(np.abs(left))) > max(EXPLAINED * usual, OF_THESE * apart):
         return None
     shift -= np.average(shift[part], weights=sigma**-2)
     moved = list(priors)
@@ -92,10 +107,37 @@ def _parts(placed: Complex, told: Complex) -> Parts:
         best, least = _best_division(placed, told, part, sorted(set(rough.tolist())))
         around = range(best - len(part) // LOOKED_AT, best + len(part) // LOOKED_AT + 1)
         best, least = _best_division(placed, told, part, [best, *around])
-        if not least < CLEARER * misfit:
+        if least < CLEARER * misfit:
+            part, misfit = _divided(part, best), least
+            continue
+        if len(middle := _middle_part(placed, told, part, CLEARER**2 * misfit)) != len(part):
             break
-        part, misfit = _divided(part, best), least
+        part, misfit = middle, _misfit(placed, told, middle)
     return part
+
+
+def _middle_part(placed: Complex, told: Complex, part: Parts, below: float) -> Parts:
+    """The parts with a further one between two others, as long as a battery lasts, which a single
+    division does not show; empty where misfits do not fall below.
+    """
+    rough = sorted(set(np.linspace(0, len(part), MIDDLES).astype(int).tolist()))
+    tried = {c: _misfit_of(placed, told, part, c) for c in combinations(rough, 2)}
+    a, b = min(tried, key=lambda c: tried[c])
+    step = len(part) // MIDDLES + 1
+    a = min(range(a - step, a + step + 1), key=lambda k: _misfit_of(placed, told, part, (k, b)))
+    b = min(range(b - step, b + step + 1), key=lambda k: _misfit_of(placed, told, part, (a, k)))
+    if not _misfit_of(placed, told, part, (a, b)) < below:
+        return np.zeros(0, np.int64)
+    return _divided(_divided(part, a), b)
+
+
+def _misfit_of(placed: Complex, told: Complex, part: Parts, ends: tuple[int, int]) -> float:
+    """The misfit with a further part between these photos; infinite where a part is too small."""
+    a, b = ends
+    if min(a, b - a, len(part) - b) < FEWEST:
+        return np.inf
+    tried = _divided(_divided(part, a), b)
+    return _misfit(placed, told, tried) if np.bincount(tried).min() >= FEWEST else np.inf
 
 
 def _best_division(

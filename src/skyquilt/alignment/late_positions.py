@@ -6,18 +6,23 @@ a map that they hold in place. From a missing line on, all that follow are shift
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.motion import Speeds
 from skyquilt.alignment.similarity_graph import fit_similarity
 from skyquilt.model.poses import Alignment, Prior
 
 FEWEST, FEWEST_PART = 10, 8
 """Photos of a camera with positions that tell whether these are shifted, and of a part of them."""
 MOST = 6
-"""Positions are sought so many photos before and after at most."""
+"""Positions of a part are sought so many photos before and after at most;"""
+WHOLE_SHARE = 0.3
+"""those of all photos up to this share of them before and after, and in reversed order; as much of
+them may misfit.
+"""
 CLEARER = 0.5
 """Shifted, positions of a part misfit by less than this share of what they misfit by before, and of
 what the nearest other shifts leave, each with the place, direction and scale that fit best.
@@ -29,6 +34,18 @@ OUTLIER = 3.0
 
 MOVED = "They were moved to the photos that they belong to."
 """Words of the note by which an alignment tells that it did so."""
+
+LAGGED = "They were moved along the flight."
+"""The same for positions of another moment than their photos."""
+LESS, LIKELIER, ASIDE = 0.7, 20.0, 0.3
+"""Positions belong to another moment where they then misfit by less than this share of what they
+misfit by, which is likelier by this (twice a logarithm), and what they are displaced by lies
+across the flight by less than this share of what it lies along it.
+"""
+COMPARED = 0.8
+"""Share of the positions that are compared, those that fit best."""
+MOVES_MS = 0.5
+"""Slower photos do not tell a moment."""
 
 Complex = NDArray[np.complex128]
 Floats = NDArray[np.float64]
@@ -50,10 +67,17 @@ def unshifted(found: Alignment, priors: Sequence[Prior], cameras: Sequence[str])
     return out if any(a is not b for a, b in zip(out, priors, strict=True)) else priors
 
 
-def as_moved(found: Alignment, priors: Sequence[Prior], cameras: Sequence[str]) -> Sequence[Prior]:
-    """The priors as an alignment took them: moved where it says so."""
+def as_moved(
+    found: Alignment, priors: Sequence[Prior], cameras: Sequence[str], speeds: Speeds
+) -> Sequence[Prior]:
+    """The priors as an alignment took them: moved where it says so, to other photos or along the
+    flight.
+    """
     told = any(MOVED in note for note in found.notes)
-    return unshifted(found, priors, cameras) if told else priors
+    priors = unshifted(found, priors, cameras) if told else priors
+    late = any(LAGGED in note for note in found.notes)
+    moved = on_time(found, priors, cameras, speeds) if late else None
+    return priors if moved is None else moved.priors
 
 
 def moved_note(before: Sequence[Prior], after: Sequence[Prior]) -> str:
@@ -63,6 +87,92 @@ def moved_note(before: Sequence[Prior], after: Sequence[Prior]) -> str:
         f"The positions of {number} photos belong to photos before or after them, in order of"
         f" capture: the pictures show it. {MOVED} Check the list or the logger that they come from."
     )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Lagged:
+    """Positions moved to the moments of their photos."""
+
+    priors: tuple[Prior, ...]
+    """The priors with these positions."""
+    note: str
+    """What is said of them."""
+
+
+def on_time(
+    found: Alignment, priors: Sequence[Prior], cameras: Sequence[str], speeds: Speeds
+) -> Lagged | None:
+    """The priors with positions moved to the moments at which photos were taken, where those of a
+    camera's photos are of another moment, the same time before or after: a receiver that is late, a
+    clock that is off. None where none are. `cameras`: that of each photo.
+
+    Along lines flown there and back such positions lie behind their photos, to one side and to the
+    other: the map is stretched and turned.
+    """
+    out, said = list(priors), list[str]()
+    for camera in dict.fromkeys(cameras):
+        own = [i for i, c in enumerate(cameras) if c == camera and i in found.poses]
+        own = [i for i in own if np.isfinite(priors[i].map_C[:2]).all()]
+        if len(own) < FEWEST:
+            continue
+        C = np.array([found.poses[i].map_C for i in own])
+        v = _plane(speeds(own, C))
+        told = _plane(np.array([priors[i].map_C for i in own]))
+        if (late := _lag(_plane(C), told, v)) is None:
+            continue
+        seconds, ahead, fits = late
+        shift = float(np.median(np.abs(ahead[np.abs(v) > MOVES_MS])))
+        for k, i in enumerate(own):
+            there = priors[i].map_C + np.array([ahead[k].real, ahead[k].imag, 0.0])
+            out[i] = replace(priors[i], map_C=there) if fits[k] else _at(priors[i], None)
+        said.append(
+            f"The positions of {len(own)} photos are those of a moment {abs(seconds):.1f} s"
+            f" {'before' if seconds > 0 else 'after'} the photos, {shift:.1f} m"
+            f" {'behind' if seconds > 0 else 'ahead of'} them: the pictures show it. {LAGGED} Check"
+            " the clock or the receiver that they come from."
+        )
+    return Lagged(priors=tuple(out), note=" ".join(said)) if said else None
+
+
+def _lag(
+    placed: Complex, told: Complex, v: Complex
+) -> tuple[float, Complex, NDArray[np.bool_]] | None:
+    """By how many seconds positions are late, what they lie behind in m (n,), and which of them fit
+    then; None where nothing tells. `v` (n,): velocities in m/s of photos as placed.
+    """
+    moves = np.abs(v) > MOVES_MS
+    if moves.sum() < FEWEST:
+        return None
+    ones = np.ones_like(placed)
+    _, before = _robust_fit((placed[moves], ones[moves]), told[moves])
+    x, after = _robust_fit((placed[moves], ones[moves], v[moves]), told[moves])
+    late = complex(-x[2] / x[0])
+    likelier = 2 * moves.sum() * np.log(max(before, 1e-9) / max(after, 1e-9))
+    if not (after < LESS * before and likelier > LIKELIER):
+        return None
+    if abs(late.imag) > ASIDE * abs(late.real):
+        return None
+    ahead = x[0] * late.real * v
+    off = np.abs(told + ahead - x[0] * placed - x[1])
+    return late.real, ahead, off <= OUTLIER * max(float(np.median(off[moves])), 1e-3)
+
+
+def _robust_fit(terms: tuple[Complex, ...], told: Complex) -> tuple[Complex, float]:
+    """Factors of terms (n,) whose sum is closest to `told`, with weights that gross errors lose;
+    and the root mean square of the smaller misfits in m.
+    """
+    A, w = np.stack(terms, 1), np.ones(len(told))
+    for _ in range(15):
+        root = np.sqrt(w)
+        x = np.linalg.lstsq(A * root[:, None], told * root, rcond=None)[0]
+        off = np.abs(told - A @ x)
+        w = 1 / (1 + (off / (3 * max(float(np.median(off)), 1e-6))) ** 2)
+    some = np.sort(off)[: max(1, round(COMPARED * len(off)))]
+    return np.asarray(x, np.complex128), float(np.sqrt((some**2).mean()))
+
+
+def _plane(places: Floats) -> Complex:
+    return np.asarray(places[:, 0] + 1j * places[:, 1], np.complex128)
 
 
 def _shifts(found: Alignment, priors: Sequence[Prior], own: Sequence[int]) -> Shifts:
@@ -77,6 +187,8 @@ def _shifts(found: Alignment, priors: Sequence[Prior], own: Sequence[int]) -> Sh
     if not fits:
         return np.zeros(len(own), np.int64)
     usual = max(min(f[2] for f in fits.values()), 1e-3)
+    if (whole := _as_a_whole(placed, told, sigma)) is not None:
+        return whole
     best, least = np.zeros(len(own), np.int64), np.inf
     likely = sorted(fits, key=lambda s: (s != 0, fits[s][2]))[:4]  # as they are, and three others
     for g, c, _ in (fits[s] for s in likely):
@@ -85,6 +197,30 @@ def _shifts(found: Alignment, priors: Sequence[Prior], own: Sequence[int]) -> Sh
         if cost < least:
             best, least = path, cost
     return _clear(best, placed, told, sigma)
+
+
+def _as_a_whole(placed: Complex, told: Complex, sigma: Floats) -> Shifts | None:
+    """How many photos after each its position stands, where all are moved by the same number beyond
+    `MOST`, or are in reversed order, and nothing else explains them nearly as well; else None.
+    """
+    number = len(told)
+    reach = int(WHOLE_SHARE * number)
+    kept = number - reach
+    back, none = number - 1 - 2 * np.arange(number), np.zeros(number, np.int64)
+    tried = [
+        (np.full(number, s), _moved(told, s), _moved(sigma, s).real)
+        for s in range(-reach, reach + 1)
+    ]
+    tried += [(back, told[::-1], sigma[::-1]), (none, np.conj(told), sigma)]  # and mirrored
+    misfits = [_own_misfit(placed, t, d, kept) for _, t, d in tried]
+    least = min((m for m in misfits if m is not None), default=0.0)
+    likely = [k for k, m in enumerate(misfits) if m is not None and CLEARER * m <= least]
+    if len(likely) == 1:
+        found = tried[likely[0]][0]
+        return found if np.abs(found).max() > MOST else None
+    # there and back, reversed is mirrored, or a line late: a warning tells of positions
+    undecided = len(tried) - 2 in likely and reach not in likely
+    return none if undecided else None
 
 
 def _fit(
@@ -152,17 +288,20 @@ def _clear(path: Shifts, placed: Complex, told: Complex, sigma: Floats) -> Shift
     return out
 
 
-def _own_misfit(placed: Complex, told: Complex, sigma: Floats) -> float | None:
+def _own_misfit(
+    placed: Complex, told: Complex, sigma: Floats, kept: int | None = None
+) -> float | None:
     """Mean distance in m of a part's photos, brought to positions by a similarity of their own,
-    from these, of the three quarters that fit best; None where too few have both.
+    from these, of so many that fit best (three quarters of those that have both); None where too
+    few have both.
     """
     both = np.isfinite(placed) & np.isfinite(told)
-    if both.sum() < FEWEST_PART:
+    if both.sum() < (kept or FEWEST_PART):
         return None
     placed, told = placed[both], told[both]
     g, c, _ = fit_similarity(placed, told, sigma[both])
     off = np.sort(np.abs(g * placed + c - told))
-    return float(off[: -(-3 * len(off) // 4)].mean())
+    return float(off[: kept or -(-3 * len(off) // 4)].mean())
 
 
 def _at(prior: Prior, other: Prior | None) -> Prior:

@@ -3,7 +3,7 @@
 A rolling shutter exposes the rows of a photo one after the other while the camera flies on.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from skyquilt.model.photo import Photo
 
 Array = NDArray[np.float64]
+Speeds = Callable[[Sequence[int], Array], Array]
+"""Velocities (k, 3) in m/s of some photos (indices) at centres (k, 3) in m; zero where unknown."""
 FASTEST_MS = 70.0
 """Greater speeds in m/s come from wrong times."""
 STRAIGHT_DEG = 30.0
@@ -59,6 +61,11 @@ def velocities(photos: Sequence[Photo], C: Array) -> Array:
         if speed == 0 or np.linalg.norm(reported) < HOVERS * speed:
             out[i] = reported
     return out
+
+
+def speeds_of(photos: Sequence[Photo]) -> Speeds:
+    """The velocities of some of these photos, wherever they are placed."""
+    return lambda own, C: velocities([photos[i] for i in own], C)
 
 
 def _along(time: Array, C: Array) -> Array:

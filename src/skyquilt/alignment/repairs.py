@@ -8,15 +8,17 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from skyquilt.alignment.displaced_parts import brought_together
+from skyquilt.alignment.crowded_positions import believed
+from skyquilt.alignment.displaced_parts import as_taken, brought_together
 from skyquilt.alignment.enlarged import enlarged_note, enlarged_photos, fits_better
 from skyquilt.alignment.false_tilts import told_no_tilt
-from skyquilt.alignment.late_positions import moved_note, unshifted
+from skyquilt.alignment.late_positions import as_moved, moved_note, on_time, unshifted
+from skyquilt.alignment.motion import Speeds
 from skyquilt.alignment.oblique import reported_oblique
-from skyquilt.alignment.oblique_guess import agrees, misled
+from skyquilt.alignment.oblique_guess import agrees, lowered, misled
 from skyquilt.alignment.oblique_start import nearer, off_positions, slanting, turned_priors, untold
 from skyquilt.errors import AlignmentError
-from skyquilt.model.poses import Alignment, Prior
+from skyquilt.model.poses import Alignment, MapFrame, Prior
 
 ENLARGED_AGAIN = 3
 """Photos that are enlarged by other factors are divided so often at most: what fits none of the
@@ -67,6 +69,8 @@ class Survey:
     """File names of the photos, in order of capture."""
     cameras: Sequence[str]
     """Names of their cameras."""
+    speeds: Speeds
+    """Velocities of the photos where they are placed."""
     linked: int
     """How many photos have links."""
     adjust: Callable[[Beginning], Alignment]
@@ -132,6 +136,14 @@ def _late_positions(last: Tried, survey: Survey) -> Tried:
     return _if_nearer(last, survey, moved, "moved ", moved_note(priors, moved))
 
 
+def _late_moments(last: Tried, survey: Survey) -> Tried:
+    """Positions of another moment are moved along the flight."""
+    late = on_time(last.found, last.begun.priors, survey.cameras, survey.speeds)
+    if late is None:
+        return last
+    return _if_nearer(last, survey, late.priors, "late ", late.note)
+
+
 def _false_tilts(last: Tried, survey: Survey) -> Tried:
     """Tilts that pictures contradict as a whole are not used."""
     if slanting(last.begun.priors):
@@ -188,9 +200,25 @@ def _if_nearer(last: Tried, survey: Survey, priors: Sequence[Prior], name: str, 
     return last
 
 
+def priors_taken(
+    found: Alignment,
+    frame: MapFrame,
+    reported: Sequence[Prior],
+    names: Sequence[str],
+    cameras: Sequence[str],
+    speeds: Speeds,
+) -> tuple[Prior, ...]:
+    """The reported priors as an alignment took them, by what it says of them; `frame`: that of the
+    reported ones, the rest as of `Survey`.
+    """
+    priors = lowered(found, believed(found, frame, reported))
+    return as_taken(found, names, as_moved(found, priors, cameras, speeds))
+
+
 REPAIRS: tuple[Callable[[Tried, Survey], Tried], ...] = (
     _enlargements,
     _late_positions,
+    _late_moments,
     _false_tilts,
     _guessed_directions,
     _found_directions,

@@ -36,6 +36,12 @@ FISHEYE = PARAMETERS.index("fisheye")
 """Column of the kind of lens among the intrinsics."""
 YAW_LIE_DEG = 20.0
 """A reported yaw further than this, in degrees, from that of the links is a gross error."""
+UNKNOWN_HEIGHT = 0.5
+"""Deviation of heights that are not known, as a share of that of the start, which takes the ground
+for level: on a mountain side it tilts photos that weigh it more than their own tilts.
+"""
+UNKNOWN_YAW_DEG = 90.0
+"""Deviation of a heading that is not known; that of the start stands for it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -283,7 +289,7 @@ def _positions(
         sigma = stated = np.full(C0.shape, 0.1 * float(np.median(height)))
     elif not known.any():  # no heights: the same for the height
         C0[:, 2] = z_ground + height
-        sigma[:, 2] = stated[:, 2] = 0.1 * float(np.median(height))
+        sigma[:, 2] = stated[:, 2] = UNKNOWN_HEIGHT * float(np.median(height))
     return (
         C0,
         np.where(np.isfinite(C0), sigma, 1.0),
@@ -314,7 +320,9 @@ def _attitudes(
             R0.append(cam_R_map_from_angles(y, prior.pitch_deg, prior.roll_deg))
         tilt = prior.sigma_tilt_deg
         sigma.append(
-            np.radians([tilt, tilt, prior.sigma_yaw_deg if trusted or turned[m] else 90.0])
+            np.radians(
+                [tilt, tilt, prior.sigma_yaw_deg if trusted or turned[m] else UNKNOWN_YAW_DEG]
+            )
         )
     return np.array(R0), np.array(sigma)
 

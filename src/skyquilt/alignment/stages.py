@@ -5,6 +5,7 @@ positions believed as far as they show to be right.
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +13,19 @@ from numpy.typing import NDArray
 from skyquilt.alignment.adjust import adjust
 from skyquilt.alignment.deviations import believed, observed_noise, robust_scale
 from skyquilt.alignment.equations import NearFactor
-from skyquilt.alignment.problem import READOUT, Problem, State, squared_residuals, swept
-from skyquilt.alignment.robust import robust_cost
+from skyquilt.alignment.problem import (
+    READOUT,
+    Problem,
+    State,
+    attitude_error,
+    squared_residuals,
+    swept,
+)
+from skyquilt.alignment.robust import position_terms, prior_terms, robust_cost
 from skyquilt.alignment.same_place import shares
-from skyquilt.alignment.setup import Setup
+from skyquilt.alignment.setup import UNKNOWN_YAW_DEG, Setup
 from skyquilt.engine.kept import MADE_NOW, Keep
+from skyquilt.geometry.frames import rotation_from_vector
 
 Array = NDArray[np.float64]
 ROLLS_PX = 0.3
@@ -31,6 +40,16 @@ CLEARLY = 9.0
 """By how much the cost of cameras that stood still must be less than that of moving ones, as their
 positions and times have them: three deviations.
 """
+FEWEST_POSITIONS, UNTOLD, SETTLING = 4, 7, 12
+"""Positions that tell where a block lies; what they are asked for (place, scale, rotation); and
+rounds in which the weights of gross errors settle.
+"""
+NUDGE, LONGEST_STEP = 1e-6, 0.5
+"""Differences by which derivatives are taken, and longest step in rad or of the scale's
+logarithm.
+"""
+LEAST_NOISE = 0.02
+"""Share of the variance that positions state, at least, as which their scatter is taken."""
 DOUBTED = 2.5
 """Positions that a block misses by more than this many deviations are not what they claim."""
 
@@ -300,6 +319,92 @@ def believe_positions(
                 if len(known) and 1.48 * np.median(known) > DOUBTED:
                     doubted[block, axes] = True
     return problem, state
+
+
+def settled(problem: Problem, state: State, setup: Setup) -> tuple[Problem, State]:
+    """The problem and the state with each block moved, turned and enlarged as a whole as its
+    positions and attitudes want it, if they want it clearly.
+
+    Observations do not tell these, so steps that follow all unknowns stop long before: of a drone
+    that climbs, positions lie within their deviations of one another.
+    """
+    if problem.offset or np.isfinite(problem.X0).any():
+        return problem, state
+    block = np.zeros(len(state.C), np.int64)
+    for number, rows in enumerate(setup.block_rows):
+        block[rows] = number
+    point_block = np.zeros(len(state.X), np.int64)
+    point_block[problem.point] = block[problem.photo]
+    R, C, X, R0 = state.R.copy(), state.C.copy(), state.X.copy(), problem.R0.copy()
+    for number, rows in enumerate(setup.block_rows):
+        if (found := _wanted(problem, state, rows)) is None:
+            continue
+        scale, turn, old, new = found
+        own = point_block == number
+        for places, mine in ((C, rows), (X, own)):
+            places[mine] = scale * (places[mine] - old) @ turn.T + new
+        R[rows] = state.R[rows] @ turn.T
+        unknown = rows[problem.sigma_R[rows, 2] >= np.radians(UNKNOWN_YAW_DEG)]
+        R0[unknown] = R0[unknown] @ _about_vertical(turn).T  # those are headings of the start
+    there, moved = replace(problem, R0=R0), replace(state, R=R, C=C, X=X)
+    gain = prior_terms(problem, state).cost - prior_terms(there, moved).cost
+    left = position_terms(there, moved)[2].sum() / max(3 * len(C) - UNTOLD, 1)
+    if gain > CLEARLY * max(min(left, 1.0), LEAST_NOISE):
+        return there, moved
+    return problem, state
+
+
+def _about_vertical(turn: Array) -> Array:
+    """The rotation about the vertical that is nearest to a rotation (3, 3)."""
+    angle = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]])
+
+
+def _wanted(
+    problem: Problem, state: State, rows: NDArray[np.int64]
+) -> tuple[float, Array, Array, Array] | None:
+    """Scale, rotation (3, 3), and a place in m before and after, by which the photos of a block
+    (rows) come closest to their positions and attitudes (Gauss-Newton); None where too few are
+    known.
+    """
+    C0, sigma = problem.C0[rows], problem.sigma_C[rows]
+    known = np.isfinite(C0).all(1)
+    if known.sum() < FEWEST_POSITIONS:
+        return None
+    spread = np.where(
+        problem.sigma_R[rows] >= np.radians(UNKNOWN_YAW_DEG), np.inf, problem.sigma_R[rows]
+    )
+    C0, sigma, C = C0[known], sigma[known], state.C[rows][known]
+    old = C.mean(0)
+    reach = max(float(np.abs(C - old).max()), 1e-6)
+    scale, turn, new = 1.0, np.eye(3), old.copy()
+
+    def residuals(x: Array, turn: Array, scale: float, new: Array) -> tuple[Array, Array]:
+        """Whitened misfits of positions and of attitudes after a step x (7,)."""
+        turn, scale = rotation_from_vector(x[None, :3])[0] @ turn, scale * np.exp(x[3])
+        e = (scale * (C - old) @ turn.T + new + x[4:] * reach - C0) / sigma
+        return e, attitude_error(state.R[rows] @ turn.T, problem.R0[rows]) / spread
+
+    for _ in range(SETTLING):
+        e, a = residuals(np.zeros(7), turn, scale, new)
+        roots = (  # of the weights of the losses
+            (1 + (e**2).sum(1, keepdims=True) / problem.loss_C**2) ** -0.25,
+            (1 + (a**2).sum(1, keepdims=True) / problem.loss_R**2) ** -0.25,
+        )
+
+        def whole(x: Array, *at: Any, roots: tuple[Array, Array] = roots) -> Array:
+            parts = residuals(x, *at)
+            return np.concatenate([(r * p).ravel() for r, p in zip(roots, parts, strict=True)])
+
+        at = (turn, scale, new)
+        here = whole(np.zeros(7), *at)
+        J = np.stack([(whole(NUDGE * unit, *at) - here) / NUDGE for unit in np.eye(7)], 1)
+        step = np.linalg.lstsq(J, -here, rcond=1e-9)[0]
+        step *= min(1.0, LONGEST_STEP / max(float(np.abs(step[:4]).max()), 1e-12))
+        turn = rotation_from_vector(np.asarray(step[None, :3], np.float64))[0] @ turn
+        scale, new = scale * float(np.exp(step[3])), new + step[4:] * reach
+    return scale, turn, old, new
 
 
 def position_noise(error: Array) -> float:

@@ -30,6 +30,13 @@ LEAST_BASE = 0.1
 """Photos whose places in the pictures lie closer than so many deviations of their positions tell no
 scale and no direction.
 """
+LOOSE_RAD = 0.15
+"""Positions that tell the direction no better than this do not tell it where headings are reported,
+nor, as badly, the scale where heights above ground are known;
+"""
+SCATTER = 10.0
+"""unless they lie further apart than so many deviations: then they are no errors of a receiver.
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -156,13 +163,24 @@ def georeference(
     spread = float(np.abs(where - where.mean()).max()) if known.sum() > 1 else 0.0
     usual = float(np.median(sigma[known]))
     shown = np.ptp(solution.t[known].view(float).reshape(-1, 2), axis=0).max()
-    shown *= _scale_by_height(solution.a, priors, ground_m)[0]
-    if known.sum() >= 2 and spread > 3 * usual and shown > LEAST_BASE * usual:
-        g, c, scatter = fit_similarity(solution.t[known], where, sigma[known])
+    height, metric = _scale_by_height(solution.a, priors, ground_m)
+    shown *= height
+    apart = height * np.abs(solution.t[known] - solution.t[known].mean())
+    headed = any(np.isfinite(p.yaw_deg) for p in priors)
+    loose = headed and float((apart**2).sum()) < (usual / LOOSE_RAD) ** 2
+    loose &= spread < SCATTER * usual + float(apart.max())
+    turn = _turn(solution.a, priors) if headed else 1 + 0j
+    if (
+        known.sum() >= 2
+        and spread > 3 * usual
+        and shown > LEAST_BASE * usual
+        and not (loose and metric)
+    ):
+        told = turn if loose else None
+        g, c, scatter = fit_similarity(solution.t[known], where, sigma[known], turn=told)
         metric = True
     else:
-        height, metric = _scale_by_height(solution.a, priors, ground_m)
-        g = height * _turn(solution.a, priors)
+        g = height * turn
         c, scatter = complex(np.mean(where - g * solution.t[known])), 0.0
     placed = replace(solution, a=solution.a * g, t=solution.t * g + c)
     far = np.maximum(np.where(known, sigma, 1e5), scatter)

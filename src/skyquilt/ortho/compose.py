@@ -324,15 +324,15 @@ class Composer:
         photo = n.view.photo
         if photo in self.exposure.offsets and warped.dtype.kind == "f":
             return warped + np.float32(self.exposure.offsets[photo])
-        if photo not in self.exposure.gains or warped.dtype != np.uint8:
+        if photo not in self.exposure.gains or warped.dtype.kind != "u":
             return warped
-        if self.exposure.uneven(photo):
-            odds = self.exposure.odds(photo, *image_place(n.view, n.u, n.v))
-            return with_odds(
-                warped,
-                densify(odds, warped.shape[0], warped.shape[1], n.step).reshape(warped.shape),
-                self.exposure.white,
-            )
+        if warped.dtype != np.uint8 or self.exposure.uneven(photo):
+            coarse = self.exposure.odds(photo, *image_place(n.view, n.u, n.v))
+            odds = densify(coarse, warped.shape[0], warped.shape[1], n.step).reshape(warped.shape)
+            if warped.dtype == np.uint8:
+                return with_odds(warped, odds, self.exposure.white)
+            bright = self.exposure.brightened(warped.astype(np.float32), odds)
+            return np.asarray(np.rint(bright), warped.dtype)
         table = self.exposure.table(photo)
         return warped if table is None else np.asarray(cv2.LUT(warped, table)).reshape(warped.shape)
 

@@ -59,6 +59,8 @@ class Exposure:
     """Photo -> offset added to measured values, in their unit."""
     white: float = WHITES[0]
     """Value at which the response ends: gains act on the odds x / (white - x)."""
+    level: float = 1.0
+    """Values of the photos that make one of the 255 levels of x: 1 for 8 bits."""
 
     def uneven(self, photo: int) -> bool:
         """Whether the photo needs more than one gain per band."""
@@ -70,9 +72,11 @@ class Exposure:
         return np.asarray(field[..., None] * np.exp(self.gains[photo]), np.float32)
 
     def grey(self, view: View, value: NDArray[Any], u: NDArray[Any], v: NDArray[Any]) -> Float:
-        """Corrected grey values (h, w) of a photo's pixels at columns u and rows v (h, w)."""
+        """Corrected grey values (h, w) of a photo's pixels at columns u and rows v (h, w); of more
+        than 8 bits as they are, since grey pictures of these are stretched one by one.
+        """
         photo = view.photo
-        if photo not in self.gains:
+        if photo not in self.gains or self.level > 1:
             return np.asarray(value, np.float32)
         field = _field(*image_place(view, u, v), self.fields[photo])
         return np.asarray(
@@ -81,8 +85,9 @@ class Exposure:
 
     def brightened(self, value: NDArray[Any], odds: NDArray[Any]) -> NDArray[Any]:
         """Values with their odds multiplied."""
-        found: NDArray[Any] = self.white * odds * value / (self.white + (odds - 1) * value)
-        return found if self.white <= WHITES[0] else np.minimum(found, WHITES[0])
+        white = self.white * self.level
+        found: NDArray[Any] = white * odds * value / (white + (odds - 1) * value)
+        return found if self.white <= WHITES[0] else np.minimum(found, WHITES[0] * self.level)
 
     def table(self, photo: int) -> NDArray[np.uint8] | None:
         """Lookup table (1, 256, bands) of a photo with gains only; None if nothing changes."""
@@ -159,7 +164,7 @@ class Balance:
     """Least share of the differences between photos that fields must explain to be applied."""
     whites: tuple[float, ...] = WHITES
     """Values at which the cameras' response may end; the survey's overlaps decide."""
-    version: ClassVar[int] = 7
+    version: ClassVar[int] = 8
 
     def under(self, white: float) -> "Balance":
         """The same for a response that is known."""

@@ -19,6 +19,8 @@ from skyquilt.ortho.exposure import NEUTRAL, Exposure
 from skyquilt.ortho.ground import Ground
 from skyquilt.settings import PictureSettings
 
+DEPTHS, LIGHTEST = (8, 10, 12, 14, 16), 99.9
+"""Bits that cameras use of 16, and the percentile of their values that tells."""
 TAG = "DRIFT"
 """Raster tag that states whether measured values are as recorded."""
 
@@ -51,7 +53,7 @@ class DriftMethod(Protocol):
 
 
 class BalanceMethod(Protocol):
-    """Exposure of 8-bit photos from their overlaps."""
+    """Exposure of photos from their overlaps, in levels of 255."""
 
     def under(self, white: float) -> "BalanceMethod":
         """The same for a response of the cameras that is known, see `Exposure.white`."""
@@ -91,6 +93,8 @@ class Levelling:
     """Whether some photos are grey and others in colours: then all bands of a photo are corrected
     alike, so that neither are tinted.
     """
+    measured: bool = False
+    """Whether values of 16 bits are measured, though they have no unit: they stay as recorded."""
 
     def __call__(self, ground: Ground) -> Exposure:
         """The photos' exposure, or the drift of measured values; neutral where neither is wanted.
@@ -115,14 +119,27 @@ class Levelling:
             return drift_of(
                 views, self.thumbnails, surface, bounds, self.unit, self.drift, self.settings
             )
-        if not self.settings.balance or self.dtype != "uint8":
+        if not self.settings.balance or self.dtype not in ("uint8", "uint16") or self.measured:
             return NEUTRAL
-        small = _Grey(self.thumbnails) if self.mixed else self.thumbnails
-        return self.balance(views, small, surface, bounds, self.keep)
+        small, level = self.thumbnails, 1.0
+        if self.dtype == "uint16":
+            level = _level([small[v.photo] for v in views])
+            small = _Levels(small, level)
+        small = _Grey(small) if self.mixed else small
+        return replace(self.balance(views, small, surface, bounds, self.keep), level=level)
 
 
-class _Grey(Mapping[int, NDArray[Any]]):
-    """Small pictures, in three equal bands."""
+def _level(pictures: Sequence[NDArray[Any]]) -> float:
+    """Values that make one of 255 levels in pictures of 16 bits, of which cameras often use 10, 12
+    or 14: the fewest that the lightest values need.
+    """
+    lightest = max((float(np.percentile(p, LIGHTEST)) for p in pictures), default=0.0)
+    bits = next(b for b in DEPTHS if lightest < 2**b or b == DEPTHS[-1])
+    return float(2**bits - 1) / 255
+
+
+class _Pictures(Mapping[int, NDArray[Any]]):
+    """Small pictures, of which each is changed when it is asked for."""
 
     def __init__(self, pictures: Mapping[int, NDArray[Any]]) -> None:
         self._pictures = pictures
@@ -136,8 +153,25 @@ class _Grey(Mapping[int, NDArray[Any]]):
     def __iter__(self) -> Iterator[int]:
         return iter(self._pictures)
 
+
+class _Grey(_Pictures):
+    """Pictures in three equal bands."""
+
     def __getitem__(self, photo: int) -> NDArray[Any]:
-        return np.repeat(to_grey8(self._pictures[photo])[..., None], 3, axis=2)
+        picture = self._pictures[photo]
+        grey = to_grey8(picture) if picture.dtype == np.uint8 else picture.mean(-1)
+        return np.repeat(grey[..., None], 3, axis=2)
+
+
+class _Levels(_Pictures):
+    """Pictures of 16 bits in levels of 0 to 255, with fractions."""
+
+    def __init__(self, pictures: Mapping[int, NDArray[Any]], level: float) -> None:
+        super().__init__(pictures)
+        self._level = np.float32(level)
+
+    def __getitem__(self, photo: int) -> NDArray[Any]:
+        return np.asarray(self._pictures[photo].astype(np.float32) / self._level)
 
 
 def drift_of(

@@ -220,7 +220,7 @@ def _rounded(photos: Sequence[Photo]) -> tuple[list[Photo], str]:
 
 def _repeated(photos: Sequence[Photo]) -> tuple[list[Photo], str]:
     """Photos of a camera that repeat the position of the photo before: the camera is somewhere on
-    the way to the next position that differs.
+    the way to the next position that differs, or, after the last one, as far as it flew meanwhile.
     """
     degrees, xyz = _degrees(photos), on_sphere(photos)
     new = np.ones(len(photos), bool)
@@ -230,7 +230,9 @@ def _repeated(photos: Sequence[Photo]) -> tuple[list[Photo], str]:
         return list(photos), ""
     run = np.cumsum(new) - 1
     to_next = np.linalg.norm(np.diff(xyz[starts], axis=0), axis=1)
-    away = np.append(to_next, to_next[-1])[run]
+    count = np.bincount(run)
+    since = (count[-1] - 1) * float(np.median(to_next / count[:-1]))
+    away = np.append(to_next, max(to_next[-1], since))[run]
     found = [
         p if first else _widened(p, float(m)) for p, first, m in zip(photos, new, away, strict=True)
     ]

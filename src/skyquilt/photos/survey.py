@@ -344,11 +344,11 @@ def _cameras(photos: Sequence[Photo]) -> Iterator[str]:
     rolling = sorted({p.camera_key for p in photos if p.rolling_shutter})
     if rolling:
         yield f"Rolling (electronic) shutter: {sentence_of(rolling)}."
-    deep = sum(p.dtype != "uint8" and p.channels == 3 for p in photos)
+    deep = sum(p.dtype == "float32" and p.channels == 3 for p in photos)
     if deep:
         yield (
-            f"{deep} photos in colour have 16 bits or more: their values are mapped as recorded,"
-            " without a balance of brightness; for one, save them with 8 bits."
+            f"{deep} photos in colour have floating-point values: these are mapped as recorded,"
+            " without a balance of brightness; for one, save them with 8 or 16 bits."
         )
 
 

@@ -73,8 +73,8 @@ def _values(
     value = smooth[row, column].astype(np.float64)
     if thumbnail.dtype.kind == "f":
         return value + exposure.offsets.get(view.photo, 0.0), np.isfinite(value)
-    known = (value > CLIPPED[0]) & (value < CLIPPED[1])
+    known = (value > CLIPPED[0] * exposure.level) & (value < CLIPPED[1] * exposure.level)
     if view.photo in exposure.gains:
         odds = exposure.odds(view.photo, *image_place(view, u[None], v[None]))[0].mean(-1)
         value = exposure.brightened(value, odds)
-    return value, known
+    return value / exposure.level, known

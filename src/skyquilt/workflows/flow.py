@@ -12,13 +12,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
-from skyquilt.alignment.crowded_positions import believed
-from skyquilt.alignment.displaced_parts import as_taken
 from skyquilt.alignment.inputs import AlignmentInputs
-from skyquilt.alignment.late_positions import as_moved
-from skyquilt.alignment.oblique_guess import lowered
+from skyquilt.alignment.motion import speeds_of
 from skyquilt.alignment.priors import choose_frame, priors
 from skyquilt.alignment.progress import AdjustmentSteps
+from skyquilt.alignment.repairs import priors_taken
 from skyquilt.engine.clock import Clock, Steps, apart
 from skyquilt.engine.free_memory import give_back_growth
 from skyquilt.engine.pixel_cache import PixelCache, pixel_budget, resident_budget
@@ -202,12 +200,13 @@ def align_photos(
     alignment = yield from clock.stage("align", _align(known, key, methods, clock))
     links.make_room()
     yield from (Note(text=n, warning=True) for n in alignment.notes)
-    trusted = _trusted(alignment, frame, found.photos, reported)
+    names, cameras = ([p.name for p in found.photos], [p.camera_key for p in found.photos])
+    speeds = speeds_of(found.photos)
     return AlignedPhotos(
         given=given,
         found=found,
         frame=frame,
-        priors=trusted,
+        priors=priors_taken(alignment, frame, reported, names, cameras, speeds),
         links=links,
         order=tuple(known.order),
         alignment=alignment,
@@ -216,15 +215,6 @@ def align_photos(
         key=key,
         earlier=earlier,
     )
-
-
-def _trusted(
-    alignment: Alignment, frame: MapFrame, photos: Sequence[Photo], reported: Sequence[Prior]
-) -> tuple[Prior, ...]:
-    """The reported priors as the alignment took them."""
-    priors = lowered(alignment, believed(alignment, frame, reported))
-    priors = as_moved(alignment, priors, [p.camera_key for p in photos])
-    return as_taken(alignment, [p.name for p in photos], priors)
 
 
 def memory_notes(photos: int, memory_gb: float | None) -> list[Note]:
@@ -345,6 +335,7 @@ def _exposure(
         settings=picture,
         keep=store.parts("balance", key),
         mixed=any(p.saved_grey for p in aligned.photos),
+        measured=first.channels != 3,  # one band may be temperatures, others are of several spectra
     )
     return store.get_or("balance", key, lambda: levelled(on))
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from skyquilt.alignment.conflicts import conflicts
-from skyquilt.alignment.contradicted_positions import enlargement_warnings, position_warnings
+from skyquilt.alignment.contradicted_positions import contradictions
 from skyquilt.alignment.heights import height_figures
 from skyquilt.alignment.oblique_start import tilt_warnings
 from skyquilt.alignment.priors import stretch_warnings
@@ -394,8 +394,7 @@ def _metrics(
             conflicts=conflicts(aligned.photos, aligned.priors, alignment),
             warnings=[
                 *aligned.links.notes,
-                *position_warnings(aligned.priors, alignment),
-                *enlargement_warnings(aligned.priors, alignment),
+                *contradictions(aligned.priors, alignment),
                 *tilt_warnings(aligned.priors, alignment),
                 *stretch_warnings(alignment.frame),
             ],
