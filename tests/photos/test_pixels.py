@@ -209,7 +209,12 @@ def test_png_of_sixteen_bits_keeps_them(tmp_path):
     photo = read_photo(tmp_path / "d.png")
     assert (photo.channels, photo.dtype, photo.alpha) == (3, "uint16", False)
     assert np.array_equal(read_color(photo), values[..., ::-1])
-    assert any("1 photos in colour have 16 bits" in n for n in read_survey(tmp_path).notes)
+    assert not any("without a balance" in n for n in read_survey(tmp_path).notes)
+
+
+def test_floating_point_colours_are_told_to_be_mapped_as_recorded(tmp_path):
+    tifffile.imwrite(tmp_path / "f.tif", pixels().astype(np.float32), photometric="rgb")
+    assert any("1 photos in colour have floating-point" in n for n in read_survey(tmp_path).notes)
 
 
 def test_truncated_tiff(tmp_path):
