@@ -245,6 +245,11 @@ def seen_as(photo: Photo) -> object:
     return (photo.digest, photo.lens) if photo.lens.fisheye else photo.digest
 
 
+def of_unknown_kind(photo: Photo) -> bool:
+    """Whether nothing but other photos tells that its lens is no fisheye's."""
+    return photo.band == "visible" and may_be_fisheye(photo.lens)
+
+
 def with_fisheyes(
     found: FeaturedPhotos, links: Links, methods: Methods
 ) -> tuple[FeaturedPhotos, tuple[str, ...]]:
@@ -262,8 +267,7 @@ def with_fisheyes(
         return two[0].px[matches.index_a], two[1].px[matches.index_b]
 
     tried = [(k.a, k.b) for k in links.links] + [(k.a, k.b) for k in links.rejected]
-    asked = {p.camera_key: p.lens for p in found.photos if p.band == "visible"}
-    asked = {key: lens for key, lens in asked.items() if may_be_fisheye(lens)}
+    asked = {p.camera_key: p.lens for p in found.photos if of_unknown_kind(p)}
     cameras = {i: p.camera_key for i, p in enumerate(found.photos)}
     lenses = fisheyes(cameras, asked, features.__getitem__, links.links, tried, matched)
     if not lenses:
