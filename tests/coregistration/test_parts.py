@@ -210,6 +210,23 @@ def test_a_frame_is_no_picture(scene):
     assert usable(Picture(values=bright)).valid.all()  # dark and bright places inside are picture
 
 
+def test_bars_of_any_colour_are_no_picture(scene):
+    screen = np.full((SHAPE[0] + 90, SHAPE[1] + 140), 77, np.uint8)
+    screen[60 : 60 + SHAPE[0], 50 : 50 + SHAPE[1]] = scene
+    valid = usable(Picture(values=screen)).valid
+    assert valid[60 : 60 + SHAPE[0], 50 : 50 + SHAPE[1]].mean() > 0.99
+    assert valid.sum() <= scene.size
+
+
+def test_what_a_hot_thing_leaves_of_the_levels_is_picture(scene):
+    """A fire takes 230 of 256 levels, and the scene is in the others: the darkest of it are no
+    frame.
+    """
+    dim = np.rint(20 + scene / 255 * 14).astype(np.uint8)
+    dim[100:120, 200:230] = 255
+    assert usable(Picture(values=dim)).valid.mean() > 0.9
+
+
 def test_what_is_given_as_invalid_stays_so(scene):
     valid = np.zeros(SHAPE, bool)
     valid[50:300, 40:400] = True
