@@ -57,8 +57,7 @@ def usable(picture: Picture) -> Usable:
     grey = np.where(finite, band, 0).astype(np.float32)
     given = finite if picture.valid is None else finite & picture.valid
     slack = _slack(grey[given]) if picture.values.dtype == np.uint8 and given.any() else 0.0
-    inside = given & ~_bars(grey, slack)
-    valid = inside & ~_frame(grey, inside, slack)
+    valid = given & ~_bars(grey, slack) & ~_frame(grey, given, slack)
     return Usable(grey=grey, valid=valid, reason=_reason(grey, valid))
 
 
