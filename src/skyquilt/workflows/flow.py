@@ -395,15 +395,12 @@ def _links(
     store: Store,
     workers: Workers,
 ) -> Steps[tuple[FeaturedPhotos, Links]]:
-    """Computes links if the alignment method needs them, or lenses whose kind only they tell; the
-    photos with the features that these refer to.
-    """
-    asked = methods.align.needs_links
-    if len(found.photos) < 2 or not (asked or any(of_unknown_kind(p) for p in found.photos)):
+    """Computes links if the method, or the kind of a lens, needs them; the photos they refer to."""
+    if len(found.photos) < 2 or not (methods.align.needs_links or of_unknown_kind(found.photos)):
         return found, Links()
     links = yield from link_photos(found, frame, reported, methods, store, workers)
     again, said = with_fisheyes(found, links, methods)
-    if not asked:
+    if not methods.align.needs_links:
         return again, Links(lenses=said)
     if said:
         found = again
