@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from skyquilt.coregistration.everywhere import Everywhere
 from skyquilt.coregistration.methods import registration_method
 from skyquilt.coregistration.structure import StructureMatches
 from skyquilt.model.estimate import NoEstimate
@@ -47,6 +48,38 @@ def test_sizes_may_differ(auto):
     a, b = pair(truth, shape_b=(256, 320), seed=4)
     found = auto(Picture(values=a), Picture(values=b))
     assert found and error(found.b_H_a, truth) < 0.4
+
+
+def test_few_pixels_of_the_whole_cost_no_search(auto, monkeypatch):
+    """Of 80 x 100 px as of 480 x 400, matches of both at the smaller size find it at once."""
+    truth = turned(0.2, 33.0, SHAPE, (80, 100), (1.0, 2.0))
+    a, b = pair(truth, shape_b=(80, 100), seed=3)
+    monkeypatch.setattr(Everywhere, "__call__", None)
+    found = auto(Picture(values=a), Picture(values=b))
+    assert found and error(found.b_H_a, truth) < 0.3
+
+
+def test_a_picture_of_a_part_of_the_other_is_found_in_it(auto):
+    truth = turned(1.0, 200.0, SHAPE, (160, 200), (-25.0, 10.0))  # a sixth of a's area
+    a, b = pair(truth, shape_b=(160, 200), seed=4)
+    found = auto(Picture(values=a), Picture(values=b))
+    assert found and error(found.b_H_a, truth) < 0.8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shape", [(220, 270), (140, 172)])  # a third and an eighth of a's area
+def test_parts_are_found_both_ways(auto, shape):
+    right = 0
+    for seed in range(12, 16):
+        turn = np.random.default_rng(seed).uniform(0, 360)
+        truth = turned(1.0, turn, SHAPE, shape, (3.0 * seed - 40, 20 - seed))
+        a, b = (Picture(values=v) for v in pair(truth, shape_b=shape, seed=seed))
+        there, back = auto(a, b), auto(b, a)
+        found = [there.b_H_a] if there else []
+        found += [np.linalg.inv(back.b_H_a)] if back else []
+        assert all(error(b_H_a, truth) < 1 for b_H_a in found)
+        right += len(found)
+    assert right >= 7
 
 
 def test_reversed_contrast_changes_nothing(auto):

@@ -200,14 +200,30 @@ def test_distinctness_of_a_picture_on_itself_and_beside(scene):
 
 def test_a_frame_is_no_picture(scene):
     bright = np.clip(scene, 30, 220)
-    framed = cv2.warpAffine(bright, cv2.getRotationMatrix2D((240, 200), 25, 0.9), (480, 400))
-    whole = cv2.warpAffine(
-        np.ones_like(scene), cv2.getRotationMatrix2D((240, 200), 25, 0.9), (480, 400)
-    )
-    found = usable(Picture(values=framed))
-    assert (found.valid != (whole > 0)).mean() < 0.01
+    for scale in (0.9, 0.5):  # the smaller one leaves whole rows black
+        turn = cv2.getRotationMatrix2D((240, 200), 25, scale)
+        framed, whole = (cv2.warpAffine(p, turn, (480, 400)) for p in (bright, np.ones_like(scene)))
+        found = usable(Picture(values=framed))
+        assert (found.valid != (whole > 0)).mean() < 0.01
     bright[:3], bright[-3:], bright[:, :3], bright[:, -3:] = 100, 100, 100, 100
     assert usable(Picture(values=bright)).valid.all()  # dark and bright places inside are picture
+
+
+def test_bars_of_any_colour_are_no_picture(scene):
+    screen = np.full((SHAPE[0] + 90, SHAPE[1] + 140), 77, np.uint8)
+    screen[60 : 60 + SHAPE[0], 50 : 50 + SHAPE[1]] = scene
+    valid = usable(Picture(values=screen)).valid
+    assert valid[60 : 60 + SHAPE[0], 50 : 50 + SHAPE[1]].mean() > 0.99
+    assert valid.sum() <= scene.size
+
+
+def test_what_a_hot_thing_leaves_of_the_levels_is_picture(scene):
+    """A fire takes 230 of 256 levels, and the scene is in the others: the darkest of it are no
+    frame.
+    """
+    dim = np.rint(20 + scene / 255 * 14).astype(np.uint8)
+    dim[100:120, 200:230] = 255
+    assert usable(Picture(values=dim)).valid.mean() > 0.9
 
 
 def test_what_is_given_as_invalid_stays_so(scene):

@@ -89,3 +89,11 @@ def test_photos_are_added_to_its_map(mosaic, wide, tmp_path):
     (camera,) = m["cameras"].values()
     assert camera["projection"] == "fisheye"
     assert [c["field"] for c in m["metadata_conflicts"]] == ["focal"]  # stated 15 % off
+
+
+@pytest.mark.parametrize("method", ["image", "flightline"])
+def test_mosaics_in_the_plane_find_it_too(mosaic, wide, method):
+    run = mosaic(wide / "photos", "--gsd", "12", "--method", method).made()
+    assert sum(run.metrics["blocks"]) == 12
+    assert any("fisheye" in w for w in run.metrics["warnings"])
+    assert np.median(placed_off_m(run.output, wide)) < 3.5  # positions of 2 m

@@ -115,6 +115,20 @@ def test_a_long_line_of_small_equal_errors_does_not_run_away():
     assert abs(error[-10:].mean() - error[:10].mean()) < 0.5
 
 
+@pytest.mark.parametrize(("jump", "ahead", "left"), [(1, 1, 0.3), (1, 3, 0.06), (4, 3, 0.06)])
+def test_a_camera_that_calibrates_itself_on_the_way_makes_no_step(jump, ahead, left):
+    """A strip of 40 frames that drift by 0.02; from the 24th on all are warmer by a jump."""
+    rng = np.random.default_rng(7)
+    true = rng.normal(0, 0.02, 40) + jump * (np.arange(40) >= 23)
+    first, second = np.array(
+        [(i, j) for i in range(40) for j in range(i + 1, min(i + ahead, 39) + 1)]
+    ).T
+    seen = true[second] - true[first] + rng.normal(0, 0.02, len(first))
+    edges = Overlaps(first=first, second=second, difference=seen, sigma=np.full(len(first), 0.02))
+    error = true + solved(edges, 40, 12)
+    assert abs(np.median(error[23:]) - np.median(error[:23])) < left
+
+
 def test_medians_of_overlaps():
     """Frame 1 is 2 above frame 0 at 9 points (one of them wild); frame 2 shares too few."""
     point = np.r_[np.arange(9), np.arange(9), np.arange(3)]

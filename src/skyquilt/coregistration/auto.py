@@ -8,26 +8,38 @@ from skyquilt.coregistration.candidates import Candidate, Nearby, distinct, same
 from skyquilt.coregistration.common_part import common_part
 from skyquilt.coregistration.decision import Decide, distinctness
 from skyquilt.coregistration.everywhere import Everywhere
-from skyquilt.coregistration.orientation import Orientation, Pyramid
+from skyquilt.coregistration.orientation import Orientation, Pyramid, full_size, orientation
 from skyquilt.coregistration.structure import StructureMatches, sharpened
 from skyquilt.coregistration.subpixel import Fit, SubpixelRefinement
-from skyquilt.coregistration.usable import both_usable
-from skyquilt.model.registration import Guess, Matrix, Picture, RefusedRegistration, Registration
+from skyquilt.coregistration.usable import Usable, both_usable
+from skyquilt.model.registration import Guess, Matrix, Outcome, Picture, RefusedRegistration
 
 _SEARCH, _NEARBY, _SELECT, _DECIDE = range(4)
+_APART = 0.04
+"""How far apart, as a share of a's longer side, places of a part are that are tried."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Auto:
     """The default method. Structure matches are fast and tolerate distortion. If patches do not
     clearly confirm them, the neighbourhood of a guess and then all rotations and a range of scales
-    are searched.
+    are searched; if nothing is confirmed, places at which one image shows a part of the other only.
     """
 
     propose: StructureMatches
     """Structure matches."""
     everywhere: Everywhere = field(default_factory=Everywhere)
     """Search without prior knowledge."""
+    larger: Everywhere = field(
+        default_factory=lambda: Everywhere(smallest=1 / 2.9, largest=1 / 1.45, overlap=0.6)
+    )
+    """Search for a as a part of b."""
+    smaller: Everywhere = field(
+        default_factory=lambda: Everywhere(smallest=1.45, largest=2.9, overlap=0.6)
+    )
+    """Search for b as a part of a."""
+    parts: int = 2
+    """Places of both that are tried."""
     nearby: Nearby = field(default_factory=Nearby)
     """Search around the guess (without a guess: two cameras side by side with equal fields of
     view).
@@ -40,11 +52,9 @@ class Auto:
     """
     sure: float = 6.0
     """Agreement above which nothing else is tried."""
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
-    def __call__(
-        self, a: Picture, b: Picture, guess: Guess | None = None
-    ) -> Registration | RefusedRegistration:
+    def __call__(self, a: Picture, b: Picture, guess: Guess | None = None) -> Outcome:
         """The registration of b to a, or the reason why there is none.
 
         A guess is tried first. If it is not confirmed, everything is searched, since metadata may
@@ -62,9 +72,12 @@ class Auto:
         if found.evidence.get("surprise", 0.0) >= self.sure:
             return found
         places = self._near(pyramid, same_view(a.shape, b.shape)) + self._anywhere(pyramid)
-        return self.decide(pyramid, first + self._best(pyramid, places))
+        found = self.decide(pyramid, first + self._best(pyramid, places))
+        if found.evidence.get("surprise", 0.0) >= self.decide.least_surprise:
+            return found
+        return self._in_part(a, b, pictures) or found
 
-    def _guided(self, a: Picture, b: Picture, guess: Guess) -> Registration | RefusedRegistration:
+    def _guided(self, a: Picture, b: Picture, guess: Guess) -> Outcome:
         """The decision in the neighbourhood of a guess, on the part that both images then share."""
         part = common_part(a, b, guess)
         pictures = both_usable(part.a, part.b)
@@ -75,6 +88,27 @@ class Auto:
         reach = part.guess.reach * max(pyramid.at(_DECIDE)[1].shape)
         return part.whole(self.decide(pyramid, fits, reach))
 
+    def _in_part(self, a: Picture, b: Picture, pictures: tuple[Usable, Usable]) -> Outcome:
+        """The decision where one image shows a part of the other only, of an eighth to a half of
+        its area. Each of the best places is a guess, so that the same ground is compared.
+        """
+        side, places = self.sides[_SEARCH], []
+        for search, sides in ((self.larger, (side, 2 * side)), (self.smaller, (2 * side, side))):
+            one, other = (
+                orientation(p.grey, p.valid, s) for p, s in zip(pictures, sides, strict=True)
+            )
+            for c in _sifted(one, other, search(one, other)):
+                score = distinctness(one, other, c.b_H_a)
+                places.append(Candidate(b_H_a=full_size(one, other, c.b_H_a), score=score))
+        found: list[Outcome] = []
+        for place in distinct(places, a.shape, _APART * max(a.shape), self.parts):
+            guess = Guess(b_H_a=place.b_H_a, reach=0.05, rotation_deg=4.0, scale=1.08)
+            found.append(self._guided(a, b, guess))
+            if found[-1].evidence.get("surprise", 0.0) >= self.sure:
+                break
+        none = RefusedRegistration(reason="no part of one image was found in the other")
+        return max(found, key=lambda o: (bool(o), o.evidence.get("surprise", 0.0)), default=none)
+
     def _near(self, pyramid: Pyramid, guess: Guess) -> list[Matrix]:
         """Candidate transforms near a guess, in px of the selection level."""
         a, b = pyramid.at(_NEARBY)
@@ -84,9 +118,7 @@ class Auto:
     def _anywhere(self, pyramid: Pyramid) -> list[Matrix]:
         """Candidate transforms of all rotations and scales, in px of the selection level."""
         a, b = pyramid.at(_SEARCH)
-        rough = distinct(self.everywhere(a, b), a.shape, 3, 40)
-        better = distinct(_sharpened(a, b, [c.b_H_a for c in rough], 2), a.shape, 1.5, 16)
-        found = distinct(_sharpened(a, b, [c.b_H_a for c in better], 3), a.shape, 1.5, 8)
+        found = _sifted(a, b, self.everywhere(a, b))
         return [pyramid.moved(c.b_H_a, _SEARCH, _SELECT) for c in found]
 
     def _best(self, pyramid: Pyramid, places: Sequence[Matrix]) -> list[Fit]:
@@ -100,6 +132,13 @@ class Auto:
         ]
         kept = distinct([Candidate(b_H_a=f.b_H_a, score=f.score) for f in fits], a.shape, 2, 3)
         return [f for f in fits if any(f.b_H_a is c.b_H_a for c in kept)]
+
+
+def _sifted(a: Orientation, b: Orientation, found: Sequence[Candidate]) -> list[Candidate]:
+    """The few best of many candidates, refined, in px of the same resolution."""
+    rough = distinct(found, a.shape, 3, 40)
+    better = distinct(_sharpened(a, b, [c.b_H_a for c in rough], 2), a.shape, 1.5, 16)
+    return distinct(_sharpened(a, b, [c.b_H_a for c in better], 3), a.shape, 1.5, 8)
 
 
 def _sharpened(

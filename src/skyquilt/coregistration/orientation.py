@@ -186,7 +186,10 @@ def at_all_shifts(
 
 
 class Pyramid:
-    """Orientation fields of two images; each resolution is computed when first needed."""
+    """Orientation fields of two images that show about the same ground; each resolution is computed
+    when first needed. Both have about as many pixels, those of the smaller image at most: in fields
+    of finer pixels, resampled to coarser ones, other edges are the strong ones.
+    """
 
     def __init__(self, *, a: Usable, b: Usable, sides: Sequence[float]) -> None:
         """`sides`: sides in px of the squares to whose areas the images are reduced."""
@@ -200,6 +203,7 @@ class Pyramid:
 
     def finer(self, side: float, blur: float) -> tuple[Orientation, Orientation]:
         """a and b at another resolution than those of the levels, smoothed otherwise."""
+        side = min(side, float(np.sqrt(self.least)))
         a, b = (orientation(p.grey, p.valid, side, blur) for p in self._pictures)
         return a, b
 
@@ -211,8 +215,7 @@ class Pyramid:
     def at(self, level: int) -> tuple[Orientation, Orientation]:
         """a and b at a level."""
         if level not in self._levels:
-            a, b = (orientation(p.grey, p.valid, self._sides[level]) for p in self._pictures)
-            self._levels[level] = a, b
+            self._levels[level] = self.finer(self._sides[level], BLUR)
         return self._levels[level]
 
     def moved(self, small: Matrix, source: int, target: int) -> Matrix:

@@ -54,7 +54,9 @@ class StructureMatches:
 
     def __call__(self, a: Usable, b: Usable) -> Proposal:
         """The transform on which most matches agree."""
-        (fa, full_a), (fb, full_b) = self._features(a), self._features(b)
+        # as many pixels of both: descriptors of the same ground are alike at the same size only
+        side = min(self.side, *(float(np.sqrt(p.grey.size)) for p in (a, b)))
+        (fa, full_a), (fb, full_b) = self._features(a, side), self._features(b, side)
         in_a, in_b = mutual(fa, fb)
         found = self.estimate(fa.px[in_a], fb.px[in_b])
         if isinstance(found, NoEstimate):
@@ -62,9 +64,9 @@ class StructureMatches:
         full = np.linalg.inv(full_b) @ found.b_H_a @ full_a
         return Proposal(b_H_a=full / full[2, 2], matches=len(in_a))
 
-    def _features(self, picture: Usable) -> tuple[IndexFeatures, Matrix]:
+    def _features(self, picture: Usable, side: float) -> tuple[IndexFeatures, Matrix]:
         """Features, and the transform from full-size pixels to theirs."""
-        grey, valid, small_S_full = shrunken(picture.grey, picture.valid, self.side)
+        grey, valid, small_S_full = shrunken(picture.grey, picture.valid, side)
         # invalid pixels get the mean, whose edges are weaker than those of black or white
         filled = np.where(valid, grey, grey[valid].mean() if valid.any() else 0).astype(np.float32)
         return index_features(

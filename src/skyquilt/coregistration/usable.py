@@ -13,13 +13,17 @@ from skyquilt.model.registration import Picture, RefusedRegistration
 SHORTEST = 48
 """Least size in px of the shorter side; in smaller images no patch could confirm a registration."""
 NEAR_END = 4
-"""Largest deviation of a black or white frame from its colour after JPEG compression, in 8-bit
-levels.
+"""Largest deviation of a frame from its colour after JPEG compression, in 8-bit levels."""
+PLAIN = 64.0
+"""Range between the 1st and 99th percentile (8-bit levels) below which less deviation is allowed: a
+hot object leaves a few levels for all the rest, and the darkest of them are no frame.
 """
 LEAST_FRAME = 0.002
 """Least share of the image covered by a frame; smaller dark spots at the border belong to the
 image.
 """
+LEAST_BAR = 0.01
+"""Least width of a bar, as a share of the image's side; a narrower one hides nothing."""
 LEAST_VALID = 0.1
 """Least share of the image that must be valid."""
 LEAST_RANGE = 3.0
@@ -44,14 +48,16 @@ class Usable:
 
 
 def usable(picture: Picture) -> Usable:
-    """Brightness and valid part of an image. A black or white frame, as in rotated images, is
-    excluded: its edges would be matched as structure, and its shape would reveal the rotation.
+    """Brightness and valid part of an image. A black or white frame, as in rotated images, and bars
+    of any one colour, as of screens, are excluded: their edges would be matched as structure, and
+    a frame's shape would reveal the rotation.
     """
     band = one_band(picture.values)
     finite = np.isfinite(band)
     grey = np.where(finite, band, 0).astype(np.float32)
     given = finite if picture.valid is None else finite & picture.valid
-    valid = given & ~_frame(grey, given, slack=NEAR_END if picture.values.dtype == np.uint8 else 0)
+    slack = _slack(grey[given]) if picture.values.dtype == np.uint8 and given.any() else 0.0
+    valid = given & ~_bars(grey, slack) & ~_frame(grey, given, slack)
     return Usable(grey=grey, valid=valid, reason=_reason(grey, valid))
 
 
@@ -62,6 +68,35 @@ def one_band(values: NDArray[Any]) -> NDArray[np.float32]:
     if values.shape[2] == 3:
         return np.asarray(cv2.cvtColor(values.astype(np.float32), cv2.COLOR_RGB2GRAY))
     return np.asarray(values.mean(2, dtype=np.float32))
+
+
+def _slack(values: NDArray[np.float32]) -> float:
+    low, high = np.percentile(values, [1, 99])
+    return NEAR_END * min(1.0, float(high - low) / PLAIN)
+
+
+def _bars(grey: NDArray[np.float32], slack: float) -> NDArray[np.bool_]:
+    """Whole rows, then whole columns between them, along the border that have one colour."""
+    bars = np.zeros(grey.shape, bool)
+    top, below = _ends(grey, slack)
+    bars[:top] = bars[below:] = True
+    if top < below:
+        left, right = _ends(grey[top:below].T, slack)
+        bars[:, :left] = bars[:, right:] = True
+    return bars
+
+
+def _ends(rows: NDArray[np.float32], slack: float) -> tuple[int, int]:
+    """First row (of n, m) beyond a bar, and the end of the last one before another."""
+
+    def count(ordered: NDArray[np.float32]) -> int:
+        same = np.ptp(ordered, axis=1) <= slack
+        same &= np.abs(ordered[:, 0] - ordered[0, 0]) <= slack
+        wide = int(np.argmin(np.r_[same, False]))
+        return wide if wide > LEAST_BAR * len(ordered) else 0
+
+    first = count(rows)
+    return first, max(len(rows) - count(rows[::-1]), first)
 
 
 def _frame(grey: NDArray[np.float32], given: NDArray[np.bool_], slack: float) -> NDArray[np.bool_]:

@@ -53,7 +53,7 @@ class Drift:
     """Fewest points that two frames must share."""
     rounds: int = 12
     """Rounds of reweighting."""
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     def __call__(
         self,
@@ -148,11 +148,12 @@ def solved(edges: Overlaps, count: int, rounds: int) -> Doubles:
     """Offsets (count,) that make frames agree: second + o[second] = first + o[first], median zero
     per component.
 
-    A weak prior of zero, with the typical difference of frames as its deviation, prevents the
-    errors from adding up along a long line of frames.
+    A weak prior of zero prevents the errors of overlaps from adding up along a long line of frames.
+    Its deviation is the typical difference of frames, or the spread of the offsets without it: a
+    camera that is calibrated anew on the way (its shutter closes) steps by much more than it
+    drifts from frame to frame, and all frames after that step have it.
     """
     from scipy import sparse  # imported here, since only thermal runs need it
-    from scipy.sparse import linalg as sparse_linalg
     from scipy.sparse.csgraph import connected_components
 
     number = np.arange(len(edges.first))
@@ -161,18 +162,33 @@ def solved(edges: Overlaps, count: int, rounds: int) -> Doubles:
         (np.r_[ones, -ones], (np.r_[number, number], np.r_[edges.second, edges.first])),
         (len(number), count),
     )
+    _, part = connected_components(A.T @ A)
     usual = 1.4826 * float(np.median(np.abs(edges.difference))) + _TINY
-    pull = sparse.identity(count) / usual**2
-    weight, offset = 1 / edges.sigma**2, np.zeros(count)
+    most = float(np.abs(edges.difference).sum()) + _TINY
+    offset = np.zeros(count)
+    for free in (most, 0.0):
+        believed = free or max(usual, float(offset.std()))
+        offset = _agreeing(edges, A, believed, usual, rounds)
+        offset -= np.array([np.median(offset[part == p]) for p in range(part.max() + 1)])[part]
+    return offset
+
+
+def _agreeing(edges: Overlaps, A: Any, believed: float, usual: float, rounds: int) -> Doubles:
+    """The offsets (count,) for a prior of that deviation, edges that do not fit down-weighted; A
+    (E, count) takes the differences of offsets.
+    """
+    from scipy import sparse
+    from scipy.sparse import linalg as sparse_linalg
+
+    pull = sparse.identity(A.shape[1]) / believed**2
+    least = max(float(np.median(edges.sigma)), _TINY)  # within it no edge is an outlier
+    weight, offset = 1 / edges.sigma**2, np.zeros(A.shape[1])
     for k in range(rounds):
         W = sparse.diags(weight)
         offset = sparse_linalg.spsolve(
             (A.T @ W @ A + pull).tocsc(), -A.T @ (weight * edges.difference)
         )
         lacking = edges.difference + A @ offset
-        scale = max(1.4826 * float(np.median(np.abs(lacking))), 0.5 * usual * 0.5**k, _TINY)
+        scale = max(1.4826 * float(np.median(np.abs(lacking))), 0.5 * usual * 0.5**k, least)
         weight = 1 / edges.sigma**2 / (1 + (lacking / (2 * scale)) ** 2)
-    _, part = connected_components(A.T @ A)
-    return np.asarray(
-        offset - np.array([np.median(offset[part == p]) for p in range(part.max() + 1)])[part]
-    )
+    return np.asarray(offset, np.float64)

@@ -38,7 +38,7 @@ from skyquilt.settings import USUAL_GB, MosaicSettings, PictureSettings
 from skyquilt.workflows.clip_frames import with_frames
 from skyquilt.workflows.finished import Earlier
 from skyquilt.workflows.keys import alignment_key, exposure_key, labels_key
-from skyquilt.workflows.links import Links, link_photos, make_room, with_fisheyes
+from skyquilt.workflows.links import Links, link_photos, make_room, of_unknown_kind, with_fisheyes
 from skyquilt.workflows.methods import Methods
 from skyquilt.workflows.photo_features import (
     FeaturedPhotos,
@@ -387,13 +387,13 @@ def _links(
     store: Store,
     workers: Workers,
 ) -> Steps[tuple[FeaturedPhotos, Links]]:
-    """Computes links if the alignment method needs them; the photos with the features that these
-    refer to.
-    """
-    if not methods.align.needs_links or len(found.photos) < 2:
+    """Computes links if the method, or the kind of a lens, needs them; the photos they refer to."""
+    if len(found.photos) < 2 or not (methods.align.needs_links or of_unknown_kind(found.photos)):
         return found, Links()
     links = yield from link_photos(found, frame, reported, methods, store, workers)
     again, said = with_fisheyes(found, links, methods)
+    if not methods.align.needs_links:
+        return again, Links(lenses=said)
     if said:
         found = again
         links = yield from link_photos(found, frame, reported, methods, store, workers)

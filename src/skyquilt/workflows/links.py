@@ -20,6 +20,7 @@ from skyquilt.matching.candidates import Pair, sequence
 from skyquilt.matching.fixed_marks import FindFixedMarks, FixedMarks
 from skyquilt.matching.lens_kind import fisheye_note, fisheyes, may_be_fisheye
 from skyquilt.matching.matchers import Guided
+from skyquilt.model.camera import Camera
 from skyquilt.model.features import Features, Link, Matches, RejectedLink, numbers
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import MapFrame, Prior
@@ -245,6 +246,14 @@ def seen_as(photo: Photo) -> object:
     return (photo.digest, photo.lens) if photo.lens.fisheye else photo.digest
 
 
+def of_unknown_kind(photos: Sequence[Photo]) -> dict[str, Camera]:
+    """Lenses by camera of which nothing but what photos have in common tells whether they are
+    fisheyes.
+    """
+    asked = {p.camera_key: p.lens for p in photos if p.band == "visible"}
+    return {key: lens for key, lens in asked.items() if may_be_fisheye(lens)}
+
+
 def with_fisheyes(
     found: FeaturedPhotos, links: Links, methods: Methods
 ) -> tuple[FeaturedPhotos, tuple[str, ...]]:
@@ -262,8 +271,7 @@ def with_fisheyes(
         return two[0].px[matches.index_a], two[1].px[matches.index_b]
 
     tried = [(k.a, k.b) for k in links.links] + [(k.a, k.b) for k in links.rejected]
-    asked = {p.camera_key: p.lens for p in found.photos if p.band == "visible"}
-    asked = {key: lens for key, lens in asked.items() if may_be_fisheye(lens)}
+    asked = of_unknown_kind(found.photos)
     cameras = {i: p.camera_key for i, p in enumerate(found.photos)}
     lenses = fisheyes(cameras, asked, features.__getitem__, links.links, tried, matched)
     if not lenses:
