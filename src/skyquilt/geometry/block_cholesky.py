@@ -151,8 +151,8 @@ def pattern(place: Array, size: int, border: int, a: Index, b: Index) -> Pattern
 
 
 def distinct(numbers: Index) -> Index:
-    """The different ones of some numbers (n,) from 0, ascending. Of a million, sorting finds them
-    in a thirtieth of the time that `numpy.unique` takes with its table.
+    """The different ones of some numbers (n,) from 0, ascending. The table that `numpy.unique`
+    makes of them is slower than sorting, the more there are: 2 to 25 times at a million.
     """
     rising = np.sort(numbers)
     return rising[np.diff(rising, prepend=-1) > 0]
