@@ -48,7 +48,7 @@ IN_NO_KEY = {
     "CERTAIN": "conflicts are told in the report and shape nothing",
     **dict.fromkeys(
         ("CONTRADICTED_PX", "FEWEST_POSITIONS", "CONTRADICTED_DEVIATIONS", "CONTRADICTED_SHARE")
-        + ("MIRRORED", "ENLARGED", "FEWEST_ENLARGED", "ALIKE"),
+        + ("MIRRORED", "ENLARGED", "FEWEST_ENLARGED", "ALIKE", "LOOSE_DEG", "LOOSE_SCALE"),
         "conflicts are told in the report and shape nothing",
     ),
     **dict.fromkeys(
