@@ -6,10 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyquilt.matching.matchers import SMOOTHEST, Mutual, _smoothest
-from skyquilt.matching.sift import Sift
+from skyquilt.matching.matchers import Mutual
 from skyquilt.model.features import Features
-from tests.texture import texture
 
 
 def unit(seed, count, dimension=32, base=None, noise=0.0):
@@ -83,37 +81,3 @@ def test_two_photos_are_equal_partners():
 def test_too_few_to_tell(m, n):
     matches = Mutual()(unit(0, m), unit(1, n))
     assert len(matches) == 0 and matches.index_b.dtype.kind == "i"
-
-
-def test_the_waves_kept_of_sift_hold_nearly_all_of_it():
-    waves = _smoothest()
-    assert np.allclose(waves.T @ waves, np.eye(SMOOTHEST), atol=1e-6)
-    features = Sift()(np.clip(texture(480, 640, seed=8), 0, 255).astype(np.uint8))
-    assert len(features) > 500 and ((features.unit @ waves) ** 2).sum(1).mean() > 0.98
-
-
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_as_many_right_matches_as_by_whole_descriptors(seed):
-    """Against OpenCV's matcher, by a turn of the picture that is known."""
-    image = np.clip(texture(480, 640, seed=seed), 0, 255).astype(np.uint8)
-    turn = cv2.getRotationMatrix2D((320, 240), 20, 0.9)
-    noise = np.random.default_rng(seed).normal(0, 6, image.shape)
-    other = np.clip(cv2.warpAffine(image, turn, (640, 480)) + noise, 0, 255).astype(np.uint8)
-    a, b = Sift()(image), Sift()(other)
-
-    def right(found):
-        i, j = np.array(sorted(found)).T
-        off = a.px[i] @ turn[:, :2].T + turn[:, 2] - b.px[j]
-        return int((np.linalg.norm(off, axis=1) < 2).sum())
-
-    crossed = {
-        (m.queryIdx, m.trainIdx)
-        for m in cv2.BFMatcher(cv2.NORM_L2, crossCheck=True).match(a.unit, b.unit)
-    }
-    clear = {
-        (m.queryIdx, m.trainIdx)
-        for m, n in cv2.BFMatcher(cv2.NORM_L2).knnMatch(a.unit, b.unit, k=2)
-        if m.distance < 0.85 * n.distance
-    }
-    whole = right(crossed & clear)
-    assert whole > 150 and right(pairs(Mutual()(a, b))) > 0.99 * whole

@@ -3,7 +3,7 @@ neighbours, and nearest neighbours within a radius of a predicted position.
 """
 
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
@@ -11,21 +11,16 @@ from numpy.typing import NDArray
 
 from skyquilt.model.features import Features, Matches
 
-SIFT_SIZE = 128
-"""Components of a SIFT descriptor: 4 x 4 cells of 8 orientations."""
-SMOOTHEST = 80
-"""So many waves over cells and orientations hold 98.5 % of RootSIFT descriptors: they are compared
-in two thirds of the time, and of 1,000 verified matches three are lost.
-"""
-CELL_SHARES = (2.8, 1.3, 0.86, 0.38)
-"""How much of these descriptors lies in waves over four cells, from the longest to the shortest,
-"""
-TURN_SHARES = (1.5, 3.4, 3.4, 1.5, 1.4, 0.46, 0.41, 0.20)
-"""and over eight orientations (geometric means over the others, of two simulated and two real
-surveys).
-"""
 LATELY = 16
-"""Photos of which what is compared is kept: those that the next pairs share."""
+"""Photos whose unit descriptors are kept: those that the next pairs share."""
+
+
+@lru_cache(maxsize=LATELY)
+def _unit(features: Features) -> NDArray[np.float32]:
+    """(N, D) descriptors of unit length, read-only."""
+    unit = features.unit
+    unit.setflags(write=False)
+    return unit
 
 
 def similarities(a: Features, b: Features) -> NDArray[np.float32]:
@@ -34,43 +29,10 @@ def similarities(a: Features, b: Features) -> NDArray[np.float32]:
     Raises:
         ValueError: the descriptors are of different kinds.
     """
-    _check_kinds(a, b)
-    return np.asarray(a.unit @ b.unit.T)
-
-
-def _check_kinds(a: Features, b: Features) -> None:
     if a.binary != b.binary or a.descriptors.shape[1] != b.descriptors.shape[1]:
         kinds = [f"{'binary' if f.binary else 'real'} of {f.descriptors.shape[1]}" for f in (a, b)]
         raise ValueError(f"descriptors of one kind expected, got {kinds[0]} and {kinds[1]}")
-
-
-@cache
-def _smoothest() -> NDArray[np.float32]:
-    """(128, SMOOTHEST) waves: cosines over rows and columns of cells (DCT-II), cosines and sines
-    around the orientations; those in which descriptors lie most.
-    """
-    k = np.arange(4)
-    cells = np.cos(np.pi / 4 * (k + 0.5) * k[:, None])
-    angle = np.pi / 4 * np.arange(8)
-    turns = [np.cos(0 * angle)]
-    turns += [wave(n * angle) for n in (1, 2, 3) for wave in (np.cos, np.sin)]
-    turns.append(np.cos(4 * angle))
-    waves = np.kron(np.kron(cells, cells), turns)
-    waves /= np.linalg.norm(waves, axis=1, keepdims=True)
-    shares = np.kron(np.kron(CELL_SHARES, CELL_SHARES), TURN_SHARES)
-    most = np.argsort(-shares, kind="stable")[:SMOOTHEST]
-    return np.asarray(waves[most].T, np.float32)
-
-
-@lru_cache(maxsize=LATELY)
-def _compared(features: Features) -> NDArray[np.float32]:
-    """(N, D) unit vectors by which keypoints are matched."""
-    d = features.descriptors
-    if features.binary or d.dtype != np.uint8 or d.shape[1] != SIFT_SIZE:  # not of SIFT
-        return features.unit
-    smooth = d.astype(np.float32) @ _smoothest()
-    length = np.linalg.norm(smooth, axis=1, keepdims=True)
-    return np.asarray(smooth / np.maximum(length, np.float32(1e-6)))
+    return np.asarray(_unit(a) @ _unit(b).T)
 
 
 def no_matches() -> Matches:
@@ -80,22 +42,19 @@ def no_matches() -> Matches:
 
 @dataclass(frozen=True, kw_only=True)
 class Mutual:
-    """Mutual nearest neighbours that are clearly nearer than the second nearest. Descriptors of
-    SIFT are compared without their shortest waves (`SMOOTHEST`).
-    """
+    """Mutual nearest neighbours that are clearly nearer than the second nearest."""
 
     ratio: float = 0.85
     """Largest ratio of the distances to the nearest and the second nearest; Hamming distances for
     binary descriptors.
     """
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 3
 
     def __call__(self, a: Features, b: Features) -> Matches:
         """Putative matches of two photos."""
         if len(a) < 2 or len(b) < 2:
-            return no_matches()
-        _check_kinds(a, b)
-        similarity = _compared(a) @ _compared(b).T
+            return Matches(index_a=np.zeros(0, np.int64), index_b=np.zeros(0, np.int64))
+        similarity = similarities(a, b)
         rows = np.arange(len(a))
         best = similarity.argmax(1)
         first = similarity[rows, best].copy()
