@@ -5,7 +5,7 @@ A receiver's error hardly changes within a flight and is another in the next. Ta
 flights beside each other stretch or shrink the map by the difference.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -124,11 +124,19 @@ def _middle_part(placed: Complex, told: Complex, part: Parts, below: float) -> P
     tried = {c: _misfit_of(placed, told, part, c) for c in combinations(rough, 2)}
     a, b = min(tried, key=lambda c: tried[c])
     step = len(part) // MIDDLES + 1
-    a = min(range(a - step, a + step + 1), key=lambda k: _misfit_of(placed, told, part, (k, b)))
-    b = min(range(b - step, b + step + 1), key=lambda k: _misfit_of(placed, told, part, (a, k)))
+    a = _least(a - step, a + step, lambda k: _misfit_of(placed, told, part, (k, b)))
+    b = _least(b - step, b + step, lambda k: _misfit_of(placed, told, part, (a, k)))
     if not _misfit_of(placed, told, part, (a, b)) < below:
         return np.zeros(0, np.int64)
     return _divided(_divided(part, a), b)
+
+
+def _least(low: int, high: int, misfit: Callable[[int], float]) -> int:
+    """The place from low to high where a misfit is least, of a wide range by ever closer ones."""
+    while (step := max(1, (high - low) // LOOKED_AT)) > 1:
+        best = min(range(low, high + 1, step), key=misfit)
+        low, high = best - step, best + step
+    return min(range(low, high + 1), key=misfit)
 
 
 def _misfit_of(placed: Complex, told: Complex, part: Parts, ends: tuple[int, int]) -> float:
