@@ -260,6 +260,7 @@ def test_maps_are_registered_by_their_places_and_stay_georeferenced(maps):
         assert np.hypot(first.x - place[0], first.y - place[1]) < 0.7
 
 
+@pytest.mark.slow
 def test_maps_in_other_systems_meet(maps):
     from rasterio.warp import calculate_default_transform, reproject
 

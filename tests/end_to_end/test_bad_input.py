@@ -475,6 +475,7 @@ def test_negative_heights(mosaic, photos):
     assert told.metrics["photos_used"] == 9
 
 
+@pytest.mark.slow
 def test_negative_heights_by_pose(mosaic, photos):
     for path in named(photos):
         relabel(path, heights=-200.0)

@@ -100,6 +100,7 @@ def test_few_views_that_are_many_or_none(frames, tmp_path):
     assert "--few-views" not in str(refused.value)
 
 
+@pytest.mark.slow
 def test_boards_that_are_never_tilted_are_refused(tmp_path):
     for k in range(3):
         pose = tilted(0, 0, 8 * k, (0.02 * k, 0, 1.7))

@@ -38,8 +38,9 @@ def moved(photo, folder, place):
     return copy
 
 
-@pytest.mark.parametrize("place", [SYDNEY, pytest.param(NEXT_ZONE, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("strangers", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("place", [SYDNEY, NEXT_ZONE])
+@pytest.mark.parametrize("strangers", [1, 2])
 def test_a_map_that_began_elsewhere_is_begun_again_where_most_photos_are(
     flight, tmp_path, place, strangers
 ):

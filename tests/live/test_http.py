@@ -461,6 +461,7 @@ def test_layers_come_and_go(site):
     assert site.web.get("/layers/it").status_code == 404
 
 
+@pytest.mark.slow
 def test_a_flood_of_tiny_requests_is_answered_and_nothing_is_lost(site):
     before = site.states()
     refused = site.web.get("/info").json()["counts"]["refused"]

@@ -209,6 +209,7 @@ def test_a_datum_that_the_first_photo_does_not_allow_is_said(flight, tmp_path):
     live.close()
 
 
+@pytest.mark.slow
 def test_without_repositioning_placed_photos_stay(flight, tmp_path):
     live = LiveMap(tmp_path / "out", LiveSettings(reposition=False))
     first = {}

@@ -144,7 +144,7 @@ def test_a_folder_that_cannot_be_read_is_named_once(watched, flight, monkeypatch
     assert [d.name for d in done if isinstance(d, Accepted)] == ["a.jpg"]
 
 
-@pytest.mark.parametrize("told", [True, False])
+@pytest.mark.parametrize("told", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_maps_that_grow_below_the_folder_are_no_photos(tmp_path, flight, monkeypatch, told):
     """The survey's own files, and those of an earlier run: they were mapped, again and again."""
     if not told:

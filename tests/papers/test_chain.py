@@ -171,6 +171,7 @@ def test_the_overview_is_searched_as_a_whole():
     assert sizes == sorted(sizes) and sizes[-1] > 2 * sizes[0]  # its cost grows: that is its nature
 
 
+@pytest.mark.slow
 def test_the_overview_closes_a_loop_that_the_chain_cannot():
     xy = np.concatenate([line(3), line(3, start=(25.0, 50.0), heading=180.0)])
     flight = fly(xy)

@@ -72,6 +72,7 @@ def test_what_was_finished_is_not_made_again(flight, tmp_path, undisturbed, stag
     assert record(out) == undisturbed
 
 
+@pytest.mark.slow
 def test_another_comparison_is_refused(flight, tmp_path):
     out = tmp_path / "out"
     compared(flight / "photos", out, ("pose: features", 1))

@@ -23,7 +23,9 @@ def run(flight, **more):
     return method(flight.photos, FRAME, flight.priors, flight.features, range(len(flight.photos)))
 
 
-@pytest.mark.parametrize("heading", [0.0, 57.0, 90.0, 200.0])
+@pytest.mark.parametrize(
+    "heading", [57.0, *(pytest.param(d, marks=pytest.mark.slow) for d in (0.0, 90.0, 200.0))]
+)
 def test_lines_of_any_direction_become_one_mosaic_in_its_place(heading):
     turn = np.radians(heading)
     rotate = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
@@ -40,6 +42,7 @@ def test_photos_that_look_back_along_every_other_line_are_no_matter():
     assert ground_error(flight, run(flight), free=False) < 0.5
 
 
+@pytest.mark.slow
 def test_the_regression_averages_the_errors_of_positions():
     flight = fly(lawn(4, 6, step=20.0, apart=30.0), gps=1.0, points=8000, seed=2)
     found = run(flight)

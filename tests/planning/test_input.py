@@ -251,6 +251,7 @@ def test_fleets(tmp_path):
         read_fleet(path, "EPSG:32633", None)
 
 
+@pytest.mark.slow
 def test_fleets_of_several_cameras_are_told_what_that_costs(tmp_path):
     fleet, out = tmp_path / "fleet.toml", tmp_path / "out"
     start = "start = {latitude = 52.1, longitude = 13.1}"

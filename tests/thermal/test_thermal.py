@@ -104,6 +104,7 @@ def test_values_are_resampled_only(maps, tmp_path):
     assert np.nanmedian(values) == pytest.approx(np.median(original), abs=0.3)
 
 
+@pytest.mark.slow
 def test_maps_of_other_places_are_not_joined(maps, tmp_path):
     a, _ = maps
     other = write(

@@ -165,6 +165,7 @@ class Counting:
         return self.inner.of_shrunken(small, full)
 
 
+@pytest.mark.slow
 def test_a_detector_of_ones_own_takes_part_in_the_real_flow(flight, tmp_path):
     settings = MosaicSettings(**QUICK)
     own = replace(methods_for(settings), detector=Counting())

@@ -3,12 +3,14 @@
 import shutil
 
 import numpy as np
+import pytest
 
 from skyquilt.settings import MosaicSettings
 from skyquilt.workflows import run_report
 from skyquilt.workflows.mosaic import iter_mosaic
 
 
+@pytest.mark.slow
 def test_large_surveys_hand_over_some_residuals(finished, flight, tmp_path, monkeypatch):
     output = shutil.copytree(finished.output, tmp_path / "out")
     settings, told = MosaicSettings(gcp=next(flight.rglob("gcp_list.txt")), jobs=2), []
@@ -36,6 +38,7 @@ def test_large_surveys_hand_over_some_residuals(finished, flight, tmp_path, monk
     assert said in pages[1] and "observations is taken" not in pages[0]
 
 
+@pytest.mark.slow
 def test_large_maps_hand_over_some_of_their_cells(finished, flight, tmp_path, monkeypatch):
     """Views and heights of every cell would fill the memory; the report shows a small picture."""
     output = shutil.copytree(finished.output, tmp_path / "out")
