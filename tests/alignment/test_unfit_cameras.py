@@ -10,7 +10,7 @@ import pytest
 
 from skyquilt.alignment.outcome import ASPECT, NO_FIT
 from skyquilt.alignment.problem import READOUT
-from skyquilt.alignment.setup import set_up
+from skyquilt.alignment.setup import priors_by_camera, set_up
 from skyquilt.alignment.start import find_start
 from skyquilt.alignment.unfit_cameras import loosened, unfit_cameras
 from skyquilt.model.camera import Camera
@@ -30,6 +30,10 @@ def found_as(*, readout_s=0.0, aspect=1.0, notes=()):
     return replace(alignment(), cameras={"cam": camera}, notes=notes)
 
 
+def judged(found, photos, distortion="full"):
+    return unfit_cameras(found, priors_by_camera(photos, distortion))
+
+
 @pytest.mark.parametrize(
     ("readout_ms", "aspect", "unfit"),
     [
@@ -44,25 +48,23 @@ def found_as(*, readout_s=0.0, aspect=1.0, notes=()):
 def test_contradictions_are_those_beyond_the_priors(readout_ms, aspect, unfit):
     found = found_as(readout_s=readout_ms / 1000, aspect=aspect)
     photos = [photo(f"{i}.jpg", shutter=UNKNOWN) for i in range(8)]
-    assert unfit_cameras(found, photos, "full") == ({"cam"} if unfit else set())
+    assert judged(found, photos) == ({"cam"} if unfit else set())
     # where nothing is adjusted, nothing contradicts
-    assert unfit_cameras(found, photos, "4") == ({"cam"} if readout_ms > 22 else set())
+    assert judged(found, photos, "4") == ({"cam"} if readout_ms > 22 else set())
 
 
 def test_what_is_stated_is_not_questioned_here():
     calibrated = Camera(width=WIDTH, height=HEIGHT, focal=FOCAL, cx=400.0, cy=300.0, aspect=1.01,
                         sigmas=(1.0, 1.0, 1.0, *[1e-3] * 3, *[1e-4] * 2, 5e-4, 0.0))  # fmt: skip
     photos = [photo(f"{i}.jpg", shutter=TOLD, calibration=calibrated) for i in range(8)]
-    assert unfit_cameras(found_as(readout_s=0.060, aspect=1.03), photos, "full") == set()
+    assert judged(found_as(readout_s=0.060, aspect=1.03), photos) == set()
 
 
 def test_photos_that_fit_no_camera_contradict_what_is_assumed():
     note = f"The photos of cam {NO_FIT}: and more."
     photos = [photo(f"{i}.jpg", shutter=UNKNOWN) for i in range(8)]
-    assert unfit_cameras(found_as(notes=(note,)), photos, "full") == {"cam"}
-    assert (
-        unfit_cameras(found_as(notes=(note.replace("cam", "cam 2", 1),)), photos, "full") == set()
-    )
+    assert judged(found_as(notes=(note,)), photos) == {"cam"}
+    assert judged(found_as(notes=(note.replace("cam", "cam 2", 1),)), photos) == set()
 
 
 def test_only_what_is_assumed_of_these_cameras_is_loosened(setup_of):

@@ -20,7 +20,7 @@ from skyquilt.alignment.oblique_start import reported_start, slanting
 from skyquilt.alignment.outcome import accuracy, ground_points, leave_one_out, misfits, undetermined
 from skyquilt.alignment.problem import Problem, State
 from skyquilt.alignment.repairs import Beginning, Survey, begun_with, repaired
-from skyquilt.alignment.setup import Setup, camera_records, pose_records, set_up
+from skyquilt.alignment.setup import Setup, camera_records, pose_records, priors_by_camera, set_up
 from skyquilt.alignment.stages import (
     believe_positions,
     fine_steps,
@@ -117,7 +117,9 @@ class Bundle:
             speeds=speeds_of(photos),
             linked=len({i for k in links for i in (k.a, k.b)}),
             adjust=adjust,
-            unfit=lambda t: unfit_cameras(t.found, enlarged(t.begun), self.distortion),
+            unfit=lambda t: unfit_cameras(
+                t.found, priors_by_camera(enlarged(t.begun), self.distortion)
+            ),
             guess=guess,
         )
         tried = begun_with(priors, survey, repair=self.repair)

@@ -132,17 +132,6 @@ def _enlargements(last: Tried, survey: Survey) -> Tried:
     return replace(best, notes=(*last.notes, enlarged_note(best.begun.enlarged, survey.cameras)))
 
 
-def _unfit_cameras(last: Tried, survey: Survey) -> Tried:
-    """Shutters and aspect ratios that pictures contradict are told by these alone."""
-    cameras = survey.unfit(last)
-    if not cameras:
-        return last
-    other = survey.tried(last.begun, loose=cameras, name="unfit ")
-    if not fits_as_well(other.found, last.found):
-        return last
-    return replace(other, notes=(*last.notes, *unfit_notes(other.found, cameras)))
-
-
 def _late_positions(last: Tried, survey: Survey) -> Tried:
     """Positions that belong to other photos are moved to these."""
     priors = last.begun.priors
@@ -197,6 +186,17 @@ def _found_directions(last: Tried, survey: Survey) -> Tried:
     return best if best is last else replace(best, notes=last.notes)
 
 
+def _unfit_cameras(last: Tried, survey: Survey) -> Tried:
+    """Shutters and aspect ratios that pictures contradict are told by these alone."""
+    cameras = survey.unfit(last)
+    if not cameras:
+        return last
+    other = survey.tried(last.begun, loose=cameras, name="unfit ")
+    if not fits_as_well(other.found, last.found):
+        return last
+    return replace(other, notes=(*last.notes, *unfit_notes(other.found, cameras)))
+
+
 def _displaced_parts(last: Tried, survey: Survey) -> Tried:
     """Parts of the survey whose positions are displaced are brought together."""
     priors = last.begun.priors
@@ -233,12 +233,12 @@ def priors_taken(
 
 REPAIRS: tuple[Callable[[Tried, Survey], Tried], ...] = (
     _enlargements,
-    _unfit_cameras,
     _late_positions,
     _late_moments,
     _false_tilts,
     _guessed_directions,
     _found_directions,
+    _unfit_cameras,
     _displaced_parts,
 )
 """All repairs, in order: each relies on those before."""

@@ -5,7 +5,7 @@ Such a camera is adjusted again with a readout time and an aspect ratio that pic
 drone that turns with its lines hardly tells the two apart, so they are loosened together.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.outcome import ASPECT, NO_FIT
 from skyquilt.alignment.problem import READOUT
-from skyquilt.alignment.setup import SIGMA_ASPECT, Setup, intrinsic_priors
-from skyquilt.model.photo import Photo
+from skyquilt.alignment.setup import SIGMA_ASPECT, Setup
 from skyquilt.model.poses import Alignment
 
+Floats = NDArray[np.float64]
 CONTRADICTED = 2.2
 """A readout time and an aspect ratio that together lie so many deviations off their priors
 contradict these.
@@ -29,15 +29,17 @@ WORSE = 1.03
 """The larger freedom is taken where photos fit at most so many times as badly with it."""
 
 
-def unfit_cameras(found: Alignment, photos: Sequence[Photo], distortion: str) -> frozenset[str]:
+def unfit_cameras(
+    found: Alignment, priors: Mapping[str, tuple[Floats, Floats, NDArray[np.bool_]]]
+) -> frozenset[str]:
     """Names of cameras whose photos contradict the shutter or the shape of pixels that is assumed
-    of them, or fit no camera as it is assumed.
+    of them, or fit no camera as it is assumed. `priors`: of each camera the values, their
+    deviations, and which are estimated (`setup.priors_by_camera`).
     """
     unfit = set[str]()
-    for key, photo in {p.camera_key: p for p in photos}.items():
+    for key, (K0, sigma, free) in priors.items():
         if (camera := found.cameras.get(key)) is None:
             continue
-        K0, sigma, free = (part[0] for part in intrinsic_priors([photo], distortion))
         apart = np.abs(np.r_[camera.vector, camera.readout_s] - K0) / sigma
         assumed = [c for c in ASSUMED if free[c] and sigma[c] >= ASSUMED[c]]
         other = float(np.linalg.norm(apart[assumed])) > CONTRADICTED
@@ -54,7 +56,7 @@ def loosened(setup: Setup, cameras: Collection[str]) -> Setup:
     if not cameras:
         return setup
     own = np.array([key in cameras for key in setup.camera_keys])
-    sigma: NDArray[np.float64] = setup.base.sigma_K.copy()
+    sigma: Floats = setup.base.sigma_K.copy()
     for c, least in ASSUMED.items():
         wide = own & setup.base.free[:, c] & (sigma[:, c] >= least)
         sigma[wide, c] = LOOSE[c]
