@@ -28,6 +28,7 @@ from tests.alignment.blocks import HEIGHT, LENS, WIDTH, make_block, seen_by
 from tests.alignment.surveys import photo, prior
 
 FRAME = MapFrame(crs="EPSG:32630", origin=(500000.0, 5600000.0), vertical_datum="takeoff")
+SLOW = pytest.mark.slow
 LOCAL = MapFrame(crs=None, origin=(0.0, 0.0), vertical_datum="takeoff")
 
 
@@ -525,21 +526,37 @@ def test_photos_that_show_nothing_are_told(blank, told):
 
 
 @pytest.mark.parametrize(
+    "aspect", [0.75, 1.03, *(pytest.param(a, marks=SLOW) for a in (0.95, 1.33))]
+)
+def test_pictures_that_are_stretched_are_taken_as_they_are(aspect):
+    """As well as pictures that nobody resized, whose centres are found to 0.35 m."""
+    flown = Flown(lens=stretched(aspect))
+    found = flown.aligned()
+    assert found.cameras["cam"].aspect == pytest.approx(aspect, abs=0.005)
+    assert relative_error(flown, found) < 0.35
+    (note,) = [n for n in found.notes if "do not fit the camera" in n]
+    assert float(note.split("the ratio ")[1].split(" ")[0]) == pytest.approx(aspect, abs=0.005)
+    assert not any("anamorphic" in n for n in found.notes)
+
+
+@pytest.mark.parametrize(
     ("aspect", "by"),
     [(0.75, "goes the same way"), (0.95, "deviations from 1"), (1.03, "deviations from 1")]
     + [(1.33, "goes the same way")],
 )
-def test_pictures_that_are_stretched_are_named(aspect, by):
-    (note,) = [n for n in Flown(lens=stretched(aspect)).aligned().notes if "anamorphic" in n]
+def test_stretched_pictures_are_named_where_nothing_is_to_be_repaired(aspect, by):
+    found = Flown(lens=stretched(aspect)).aligned(repair=False)
+    (note,) = [n for n in found.notes if "anamorphic" in n]
     assert note.startswith("The photos of cam ") and by in note
     if "deviations" in by:
-        found = float(note.split("of the ratio ")[1].split(",")[0])
-        assert found == pytest.approx(aspect, abs=0.01)
+        said = float(note.split("of the ratio ")[1].split(",")[0])
+        assert said == pytest.approx(aspect, abs=0.01)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_ordinary_pictures_are_not_called_stretched(seed):
-    assert not any("anamorphic" in n for n in Flown(seed).aligned().notes)
+    notes = " ".join(Flown(seed).aligned().notes)
+    assert "anamorphic" not in notes and "do not fit" not in notes
 
 
 def test_a_stretched_picture_that_its_calibration_tells_is_not_named():

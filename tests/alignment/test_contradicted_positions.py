@@ -121,6 +121,18 @@ def test_a_direction_that_positions_hardly_tell(reach, loose):
     assert loose_warnings(headless, block(ring, crs=None)) == []
 
 
+def test_the_position_of_one_photo_tells_neither_direction_nor_scale():
+    told = [replace(p, yaw_deg=np.nan) for p in told_at(LINES, 2.0)]
+    only = [told[0], *(replace(p, map_C=np.full(3, np.nan)) for p in told[1:])]
+    found = block(LINES)
+    nowhere = replace(found, frame=replace(found.frame, vertical_datum="sea_level", takeoff_m=None))
+    (said,) = loose_warnings(only, nowhere)
+    assert "turned by 180 degrees" in said and "small by 100 %" in said
+    assert "the position of a single photo does not tell it" in said
+    none = [replace(p, map_C=np.full(3, np.nan)) for p in told]
+    assert loose_warnings(none, nowhere) == []
+
+
 def test_a_scale_that_positions_hardly_tell_is_told_where_no_height_above_ground_does():
     angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
     ring = np.column_stack([3 * np.cos(angle), 3 * np.sin(angle), np.full(12, 50.0)])

@@ -20,7 +20,7 @@ from skyquilt.alignment.oblique_start import reported_start, slanting
 from skyquilt.alignment.outcome import accuracy, ground_points, leave_one_out, misfits, undetermined
 from skyquilt.alignment.problem import Problem, State
 from skyquilt.alignment.repairs import Beginning, Survey, begun_with, repaired
-from skyquilt.alignment.setup import Setup, camera_records, pose_records, set_up
+from skyquilt.alignment.setup import Setup, camera_records, pose_records, priors_by_camera, set_up
 from skyquilt.alignment.stages import (
     believe_positions,
     fine_steps,
@@ -32,6 +32,7 @@ from skyquilt.alignment.stages import (
 from skyquilt.alignment.start import Start, find_start, ground_of
 from skyquilt.alignment.tracks import Thinning, Tracks, build_tracks, thin
 from skyquilt.alignment.triangulate import triangulated
+from skyquilt.alignment.unfit_cameras import loosened, unfit_cameras
 from skyquilt.alignment.upside_down import turned_note, upside_down
 from skyquilt.engine.free_memory import give_back
 from skyquilt.engine.kept import MADE_NOW, Keep
@@ -71,7 +72,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 52
+    version: ClassVar[int] = 53
 
     def __call__(
         self,
@@ -105,9 +106,7 @@ class Bundle:
                 else Keep(workers=keep.workers, told=keep.told)
             )
             own = enlarged(begun)
-            return self._block(
-                own, frame, begun.told, features, upright, control, grey, part, make_room
-            )
+            return self._block(own, frame, begun, features, upright, control, grey, part, make_room)
 
         def guess(begun: Beginning) -> Sequence[Prior] | None:
             return guessed_priors(enlarged(begun), begun.priors, features, links)
@@ -118,6 +117,9 @@ class Bundle:
             speeds=speeds_of(photos),
             linked=len({i for k in links for i in (k.a, k.b)}),
             adjust=adjust,
+            unfit=lambda t: unfit_cameras(
+                t.found, priors_by_camera(enlarged(t.begun), self.distortion)
+            ),
             guess=guess,
         )
         tried = begun_with(priors, survey, repair=self.repair)
@@ -168,7 +170,7 @@ class Bundle:
         self,
         photos: Sequence[Photo],
         frame: MapFrame,
-        priors: Sequence[Prior],
+        begun: Beginning,
         features: Sequence[Features],
         links: Sequence[Link],
         control: Sequence[Control],
@@ -177,10 +179,12 @@ class Bundle:
         make_room: Callable[[], None],
     ) -> Alignment:
         """Adjusts the photos that these links connect."""
+        priors = begun.told
         start, tracks = self._begun(photos, frame, priors, features, links, keep)
         sizes = [(p.width, p.height) for p in photos]
         large = len(start.placed) > self.many
         setup = set_up(photos, priors, start, distortion=self.distortion, repair=self.repair)
+        setup = loosened(setup, begun.loose)
         begin = each = self.per_photo
         least = 0
         if large:

@@ -85,7 +85,7 @@ def loose_warnings(priors: Sequence[Prior], alignment: Alignment) -> list[str]:
     held = [i for i in max(alignment.blocks, key=len, default=()) if i in alignment.poses]
     told = [i for i in held if np.isfinite(priors[i].map_C[:2]).all()]
     control = any(not c.check for c in alignment.control)
-    if alignment.frame.crs is None or len(told) < 2 or control:
+    if alignment.frame.crs is None or not told or control:
         return []
     C = np.array([alignment.poses[i].map_C for i in told])
     off = np.array([priors[i].map_C for i in told]) - C
@@ -110,10 +110,15 @@ def loose_warnings(priors: Sequence[Prior], alignment: Alignment) -> list[str]:
     if not says:
         return []
     usual = float(np.sqrt((reach[:, :2] ** 2).sum(1).mean()))
+    why = (
+        f"positions lie {usual:.2g} m from their middle and err by {np.median(sigma[:, 0]):.2g} m,"
+        " so they hardly tell it"
+        if len(told) > 1
+        else "the position of a single photo does not tell it"
+    )
     return [
-        f"The map may {' and '.join(says)}: positions lie {usual:.2g} m from their middle and err"
-        f" by {np.median(sigma[:, 0]):.2g} m, so they hardly tell it. Give camera angles and"
-        " heights, or control points."
+        f"The map may {' and '.join(says)}: {why}. Give camera angles and heights, or control"
+        " points."
     ]
 
 

@@ -34,6 +34,9 @@ lens fits: 0 to 0.16 on ordinary flights, 0.43 to 0.56 where one side of the pho
 third longer.
 """
 ASPECT = PARAMETERS.index("aspect")
+"""Column of the aspect ratio among the intrinsics."""
+NO_FIT = "do not fit a camera as it is taken for"
+"""Words of the note of a camera whose residuals correlate so."""
 
 
 def leave_one_out(
@@ -171,7 +174,7 @@ def misfits(setup: Setup, problem: Problem, state: State) -> tuple[str, ...]:
             )
         elif alike[row] > UNFIT:
             why = (
-                "do not fit a camera as it is taken for: what is left unexplained goes the same way"
+                f"{NO_FIT}: what is left unexplained goes the same way"
                 f" over whole parts of a photo (correlation {alike[row]:.2f}; where all fits, at"
                 " most 0.16). A rolling shutter that nothing tells (--shutter rolling), pictures"
             )

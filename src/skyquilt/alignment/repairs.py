@@ -17,6 +17,7 @@ from skyquilt.alignment.motion import Speeds
 from skyquilt.alignment.oblique import reported_oblique
 from skyquilt.alignment.oblique_guess import agrees, lowered, misled
 from skyquilt.alignment.oblique_start import nearer, off_positions, slanting, turned_priors, untold
+from skyquilt.alignment.unfit_cameras import fits_as_well, unfit_notes
 from skyquilt.errors import AlignmentError
 from skyquilt.model.poses import Alignment, MapFrame, Prior
 
@@ -42,6 +43,8 @@ class Beginning:
     """Photos that are not adjusted, but hung on the others afterwards."""
     enlarged: Mapping[int, float] = field(default_factory=dict)
     """Factors of photos that are enlarged against others of their camera."""
+    loose: frozenset[str] = frozenset()
+    """Cameras whose shutters and aspect ratios pictures alone tell."""
     name: str = ""
     """Tells parts of this adjustment that are kept from those of others."""
 
@@ -75,6 +78,8 @@ class Survey:
     """How many photos have links."""
     adjust: Callable[[Beginning], Alignment]
     """Adjusts the survey."""
+    unfit: Callable[[Tried], frozenset[str]]
+    """Names of cameras that photos contradict (`unfit_cameras`)."""
     guess: Callable[[Beginning], Sequence[Prior] | None]
     """Priors with directions with which matched rays meet clearly better; None without any."""
 
@@ -181,6 +186,17 @@ def _found_directions(last: Tried, survey: Survey) -> Tried:
     return best if best is last else replace(best, notes=last.notes)
 
 
+def _unfit_cameras(last: Tried, survey: Survey) -> Tried:
+    """Shutters and aspect ratios that pictures contradict are told by these alone."""
+    cameras = survey.unfit(last)
+    if not cameras:
+        return last
+    other = survey.tried(last.begun, loose=cameras, name="unfit ")
+    if not fits_as_well(other.found, last.found):
+        return last
+    return replace(other, notes=(*last.notes, *unfit_notes(other.found, cameras)))
+
+
 def _displaced_parts(last: Tried, survey: Survey) -> Tried:
     """Parts of the survey whose positions are displaced are brought together."""
     priors = last.begun.priors
@@ -222,6 +238,7 @@ REPAIRS: tuple[Callable[[Tried, Survey], Tried], ...] = (
     _false_tilts,
     _guessed_directions,
     _found_directions,
+    _unfit_cameras,
     _displaced_parts,
 )
 """All repairs, in order: each relies on those before."""

@@ -350,6 +350,15 @@ def intrinsic_priors(
     return np.array(K0), np.array(sigma), free
 
 
+def priors_by_camera(
+    photos: Sequence[Photo], distortion: str
+) -> dict[str, tuple[Array, Array, NDArray[np.bool_]]]:
+    """`intrinsic_priors` of each camera, by its name."""
+    first = {p.camera_key: p for p in reversed(photos)}
+    told = zip(*intrinsic_priors(list(first.values()), distortion), strict=True)
+    return dict(zip(first, told, strict=True))
+
+
 def _calibrated_sigma(camera: Camera, sigma_focal: float) -> Array:
     """Standard deviations of a known calibration: those stated by it, but at least the amount by
     which a lens changes in flight.

@@ -1,0 +1,94 @@
+"""Cameras that contradict the shutter and the square pixels that are assumed of them.
+
+Whole maps with them: `tests/end_to_end/test_untold_shutter.py`; resized pictures: `test_bundle.py`.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from skyquilt.alignment.outcome import ASPECT, NO_FIT
+from skyquilt.alignment.problem import READOUT
+from skyquilt.alignment.setup import priors_by_camera, set_up
+from skyquilt.alignment.start import find_start
+from skyquilt.alignment.unfit_cameras import loosened, unfit_cameras
+from skyquilt.model.camera import Camera
+from skyquilt.model.photo import Shutter
+from tests.alignment.surveys import FOCAL, HEIGHT, WIDTH, alignment, photo
+from tests.alignment.test_bundle import Flown
+
+UNKNOWN = Shutter(readout_s=0.0, sigma_s=0.010, source="unknown")
+TOLD = Shutter(readout_s=0.030, sigma_s=0.003, source="table")
+
+
+def found_as(*, readout_s=0.0, aspect=1.0, notes=()):
+    camera = Camera(
+        width=WIDTH, height=HEIGHT, focal=FOCAL, cx=400.0, cy=300.0, aspect=aspect,
+        readout_s=readout_s,
+    )  # fmt: skip
+    return replace(alignment(), cameras={"cam": camera}, notes=notes)
+
+
+def judged(found, photos, distortion="full"):
+    return unfit_cameras(found, priors_by_camera(photos, distortion))
+
+
+@pytest.mark.parametrize(
+    ("readout_ms", "aspect", "unfit"),
+    [
+        (0.0, 1.0, False),
+        (10.0, 1.003, False),  # a deviation each
+        (-10.0, 0.997, False),
+        (23.0, 1.0, True),
+        (0.0, 1.007, True),
+        (16.0, 0.995, True),  # 1.6 and 1.7 deviations
+    ],
+)
+def test_contradictions_are_those_beyond_the_priors(readout_ms, aspect, unfit):
+    found = found_as(readout_s=readout_ms / 1000, aspect=aspect)
+    photos = [photo(f"{i}.jpg", shutter=UNKNOWN) for i in range(8)]
+    assert judged(found, photos) == ({"cam"} if unfit else set())
+    # where nothing is adjusted, nothing contradicts
+    assert judged(found, photos, "4") == ({"cam"} if readout_ms > 22 else set())
+
+
+def test_what_is_stated_is_not_questioned_here():
+    calibrated = Camera(width=WIDTH, height=HEIGHT, focal=FOCAL, cx=400.0, cy=300.0, aspect=1.01,
+                        sigmas=(1.0, 1.0, 1.0, *[1e-3] * 3, *[1e-4] * 2, 5e-4, 0.0))  # fmt: skip
+    photos = [photo(f"{i}.jpg", shutter=TOLD, calibration=calibrated) for i in range(8)]
+    assert judged(found_as(readout_s=0.060, aspect=1.03), photos) == set()
+
+
+def test_photos_that_fit_no_camera_contradict_what_is_assumed():
+    note = f"The photos of cam {NO_FIT}: and more."
+    photos = [photo(f"{i}.jpg", shutter=UNKNOWN) for i in range(8)]
+    assert judged(found_as(notes=(note,)), photos) == {"cam"}
+    assert judged(found_as(notes=(note.replace("cam", "cam 2", 1),)), photos) == set()
+
+
+def test_only_what_is_assumed_of_these_cameras_is_loosened(setup_of):
+    setup = setup_of({"a": UNKNOWN, "b": UNKNOWN, "c": TOLD})
+    rows = [setup.camera_keys.index(k) for k in "abc"]
+    loose = loosened(setup, {"a", "c"}).base.sigma_K
+    a, b, c = rows
+    assert np.array_equal(loose[b], setup.base.sigma_K[b])
+    assert loose[a, READOUT] == 0.1 and loose[a, ASPECT] == loose[c, ASPECT] == 0.1
+    assert loose[c, READOUT] == pytest.approx(TOLD.sigma_s)
+    rest = [k for k in range(loose.shape[1]) if k not in (READOUT, ASPECT)]
+    assert np.array_equal(loose[:, rest], setup.base.sigma_K[:, rest])
+    assert loosened(setup, ()) is setup
+
+
+@pytest.fixture
+def setup_of():
+    def made(shutters):
+        flown = Flown()
+        photos = [
+            replace(p, camera_key=key, shutter=shutters[key])
+            for p, key in zip(flown.photos, sorted(shutters) * 6, strict=True)
+        ]
+        start = find_start(photos, flown.priors, flown.features, flown.links, 0.0)
+        return set_up(photos, flown.priors, start, distortion="full", repair=True)
+
+    return made
