@@ -541,8 +541,11 @@ def test_pictures_that_are_stretched_are_taken_as_they_are(aspect):
 
 @pytest.mark.parametrize(
     ("aspect", "by"),
-    [(0.75, "goes the same way"), (0.95, "deviations from 1"), (1.03, "deviations from 1")]
-    + [(1.33, "goes the same way")],
+    [(0.75, "goes the same way"), (1.03, "deviations from 1")]
+    + [
+        pytest.param(1.33, "goes the same way", marks=SLOW),
+        pytest.param(0.95, "deviations from 1", marks=SLOW),
+    ],
 )
 def test_stretched_pictures_are_named_where_nothing_is_to_be_repaired(aspect, by):
     found = Flown(lens=stretched(aspect)).aligned(repair=False)
