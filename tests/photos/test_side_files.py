@@ -192,6 +192,48 @@ def test_mrk_moves_the_antenna_to_the_camera(tmp_path):
         read_mrk(tmp_path / "t.MRK", ["IMG_1.JPG"])
 
 
+MRK = "".join(
+    f"{k}\t1.0\t[2120]\t0,N\t0,E\t0,V\t46.{k}000,Lat\t-92.0,Lon\t92,Ellh\t0.01, 0.01, 0.02\t50,Q\n"
+    for k in (1, 2)
+)
+
+
+def flights(make_jpeg, *names):
+    return [
+        replace(read_photo(make_jpeg(n, exif=dji_exif(), seed=k)), name=n)
+        for k, n in enumerate(names)
+    ]
+
+
+def test_shots_of_a_flight_are_not_given_to_another(tmp_path, make_jpeg):
+    """Numbers begin anew with each flight: those beside the file are meant."""
+    photos = flights(make_jpeg, "a/DJI_0001.JPG", "a/DJI_0002.JPG", "b/DJI_0001.JPG")
+    (after, notes) = apply_positions(photos, written(tmp_path, MRK, "a/t.MRK"))
+    assert [p.position.latitude_deg for p in after] == [
+        pytest.approx(46.1),
+        pytest.approx(46.2),
+        photos[2].position.latitude_deg,
+    ]
+    assert notes[0] == "t.MRK placed 2 of 3 photos." and "b/DJI_0001.JPG" in notes[1]
+    with pytest.raises(SideFileError, match="one flight, and both a/DJI_0001.JPG and b/DJI_0001"):
+        apply_positions(photos, written(tmp_path, MRK, "t.MRK"))
+    (after, _) = apply_positions(photos[1:], tmp_path / "t.MRK")  # no number twice: both are of it
+    assert [p.position.latitude_deg for p in after] == [pytest.approx(46.2), pytest.approx(46.1)]
+
+
+def test_photos_of_one_shot_in_several_bands_have_its_place(tmp_path, make_jpeg):
+    photos = flights(make_jpeg, "DJI_0001_W.JPG", "DJI_0001_T.JPG")
+    (after, _) = apply_positions(photos, written(tmp_path, MRK, "t.MRK"))
+    assert [p.position.latitude_deg for p in after] == [pytest.approx(46.1)] * 2
+
+
+def test_frames_of_two_videos_do_not_share_a_telemetry(tmp_path, make_jpeg):
+    photos = flights(make_jpeg, "a/frame_0001.JPG", "b/frame_0001.JPG")
+    photos = [replace(p, time=None) for p in photos]
+    with pytest.raises(SideFileError, match=r"one flight, and both a/frame_0001.JPG and b/"):
+        read_srt(written(tmp_path, NEW, "a.srt"), photos)
+
+
 NEW = """1
 00:00:00,000 --> 00:00:00,033
 <font size="28">FrameCnt: 1, DiffTime: 33ms

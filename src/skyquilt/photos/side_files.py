@@ -1,8 +1,9 @@
 """Positions from side files: CSV, OpenDroneMap's geo.txt, DJI's MRK; SRT has its own module."""
 
 import math
+import os
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,7 @@ from skyquilt.photos.side_rows import (
     finite,
     metres_of_height,
     number,
+    of_one_flight,
     read_crs,
     read_lines,
     read_table,
@@ -41,7 +43,10 @@ def apply_positions(
         placed, said = apply_rows(photos, rows, file=file, source="csv")
         return placed, (*said, *notes)
     if ending == ".mrk":
-        return apply_rows(photos, read_mrk(file, [p.name for p in photos]), file=file, source="mrk")
+        here = os.path.realpath(file.parent)
+        beside = {p.name for p in photos if os.path.realpath(p.path.parent) == here}
+        rows = read_mrk(file, [p.name for p in photos], beside)
+        return apply_rows(photos, rows, file=file, source="mrk")
     if ending == ".srt":
         return apply_rows(photos, read_srt(file, photos), file=file, source="srt")
     placed, said = apply_rows(photos, read_geo_txt(file), file=file, source="geo.txt")
@@ -266,8 +271,12 @@ _SHOT = re.compile(r"_([0-9]{4,18})(?:_[A-Za-z]+)?$")
 _METRES_PER_DEGREE = 111_320.0
 
 
-def read_mrk(path: Path, photo_names: Sequence[str]) -> tuple[SideRow, ...]:
-    """Camera positions of the photos whose index is in the file; raises `SideFileError`."""
+def read_mrk(
+    path: Path, photo_names: Sequence[str], beside: Collection[str] = ()
+) -> tuple[SideRow, ...]:
+    """Camera positions of the photos whose index is in the file, of those `beside` it where photos
+    of several flights have the same; raises `SideFileError`.
+    """
     shots = {}
     for i, line in read_lines(path):
         found = _LINE.match(line)
@@ -281,8 +290,11 @@ def read_mrk(path: Path, photo_names: Sequence[str]) -> tuple[SideRow, ...]:
         for value in values[6:]:
             accuracy(value, f"{path.name}, line {i}")
         shots[int(found[1])] = values
-    pairs = ((name, shots.get(_index(name))) for name in photo_names)
-    rows = tuple(_mrk_row(name, shot) for name, shot in pairs if shot)
+    indices = [i if (i := _index(name)) in shots else None for name in photo_names]
+    if any(i is not None for i in indices):
+        indices = of_one_flight(photo_names, indices, file=path.name, beside=beside)
+    pairs = zip(photo_names, indices, strict=True)
+    rows = tuple(_mrk_row(name, shots[i]) for name, i in pairs if i is not None)
     if not rows:
         raise SideFileError(
             f"{path.name} has shots {min(shots, default=0)} to {max(shots, default=0)}; no photo's"

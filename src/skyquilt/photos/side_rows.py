@@ -3,7 +3,7 @@
 import csv
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
@@ -23,6 +23,7 @@ _ALTITUDE = (-12_000.0, 100_000.0)
 """Heights in m that are taken."""
 _MOST_ANGLE = 100_000.0
 _MOST_CRS = 20_000
+_LETTERS = re.compile(r"[a-z]*$")
 _DECIMAL_COMMA = re.compile(r"[-+]?[0-9]{1,15},[0-9]{1,20}")
 
 
@@ -68,6 +69,48 @@ class PhotoNames:
             if len(found) == 1:
                 return found[0]
         return None
+
+
+def of_one_flight(
+    names: Sequence[str], shots: Sequence[int | None], *, file: str, beside: Collection[str] = ()
+) -> list[int | None]:
+    """The number of each photo's shot in a file of one flight, None for photos of others: numbers
+    begin anew with each flight. Where several photos have one, those that lie `beside` the file
+    are meant; `names`: of all photos.
+
+    Raises:
+        SideFileError: that does not tell which are meant.
+    """
+    if (twice := _claimed_twice(names, shots)) is None:
+        return list(shots)
+    near = [s if n in beside else None for n, s in zip(names, shots, strict=True)]
+    if any(s is not None for s in near) and _claimed_twice(names, near) is None:
+        return near
+    shot, a, b = twice
+    raise SideFileError(
+        f"{file} is of one flight, and both {plain(a, 80)} and {plain(b, 80)} have its number"
+        f" {shot}. Map the flights one by one, or give the positions of all photos in a CSV."
+    )
+
+
+def _claimed_twice(
+    names: Sequence[str], shots: Sequence[int | None]
+) -> tuple[int, str, str] | None:
+    """A shot that two photos of one kind have, and these; None where there is none."""
+    first: dict[tuple[int, str], str] = {}
+    for name, shot in zip(names, shots, strict=True):
+        if shot is None:
+            continue
+        before = first.setdefault((shot, _kind(name)), name)
+        if before != name:
+            return shot, before, name
+    return None
+
+
+def _kind(name: str) -> str:
+    """What tells photos of one shot apart: letters behind its number, and the ending."""
+    path = PurePosixPath(name.lower())
+    return f"{_LETTERS.search(path.stem)[0]}{path.suffix}"  # type: ignore[index] - it always matches
 
 
 def sentence_of(names: Sequence[str]) -> str:
