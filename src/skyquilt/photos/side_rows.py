@@ -6,6 +6,7 @@ import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
+from string import ascii_lowercase
 from typing import TYPE_CHECKING
 
 from skyquilt.errors import SideFileError
@@ -23,7 +24,6 @@ _ALTITUDE = (-12_000.0, 100_000.0)
 """Heights in m that are taken."""
 _MOST_ANGLE = 100_000.0
 _MOST_CRS = 20_000
-_LETTERS = re.compile(r"[a-z]*$")
 _DECIMAL_COMMA = re.compile(r"[-+]?[0-9]{1,15},[0-9]{1,20}")
 
 
@@ -110,7 +110,7 @@ def _claimed_twice(
 def _kind(name: str) -> str:
     """What tells photos of one shot apart: letters behind its number, and the ending."""
     path = PurePosixPath(name.lower())
-    return f"{_LETTERS.search(path.stem)[0]}{path.suffix}"  # type: ignore[index] - it always matches
+    return path.stem[len(path.stem.rstrip(ascii_lowercase)) :] + path.suffix
 
 
 def sentence_of(names: Sequence[str]) -> str:
