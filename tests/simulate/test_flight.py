@@ -168,3 +168,9 @@ def test_absurd_numbers_are_refused(part, values):
     )
     with pytest.raises(UsageError, match=next(iter(values)).split("_")[0].replace("gps", "GPS")):
         settings.checked()
+
+
+@pytest.mark.parametrize("settings", [FULL, StripSettings()], ids=["flight", "strip"])
+def test_a_seed_is_not_negative(settings):
+    with pytest.raises(UsageError, match="seed must not be negative"):
+        replace(settings, seed=-1).checked()

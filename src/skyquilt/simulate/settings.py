@@ -328,6 +328,7 @@ def _other_rules(settings: FlightSettings) -> _Rules:
     hour, relief, control = settings.weather.hour, settings.scene.relief, settings.control
     reporting, pictures = settings.reporting, settings.pictures
     return [
+        (settings.seed >= 0, f"the seed must not be negative, not {settings.seed}"),
         (relief >= 0, f"relief must not be negative, not {relief:g} m"),
         (0 <= hour < 24, f"hour must be 0 to 24, not {hour:g}"),
         (

@@ -63,6 +63,7 @@ class StripSettings:
         for name in not_finite(self):
             raise UsageError(f"{name} must be a number, not nan or infinite")
         rules = [
+            (self.seed >= 0, f"the seed must not be negative, not {self.seed}"),
             (2 <= self.photos <= 500, f"photos must be 2 to 500, not {self.photos}"),
             (
                 0.3 <= self.overlap <= 0.95,
