@@ -83,7 +83,7 @@ _OTHER_UNIT = re.compile(
 _ALIASES = frozenset(alias for aliases in _COLUMNS.values() for alias in aliases)
 _UNITS = ("m", "metre", "metres", "meter", "meters", "deg", "degree", "degrees")
 _WITH_UNIT = re.compile(
-    rf"({'|'.join(sorted(_ALIASES, key=len, reverse=True))})"
+    rf"({'|'.join(sorted(_ALIASES))})"
     rf"({'|'.join(_UNITS)}|(?:ussurvey|us|intl|international)?(?:ft|feet|foot)|rad|radians?|gon|km|cm|mm)"
 )
 """Letters of a column's name that ends in its unit."""
