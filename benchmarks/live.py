@@ -231,7 +231,7 @@ def seams(survey: Path, gsd: float) -> None:
         steps = orthomosaic.draw(
             home, compose, alignment, settings.output, None, store, "live", photos[0].unit, 2
         )
-        of_live = drain(measure_seams(compose, drain(steps), ground)).figures
+        of_live = measure_seams(compose, drain(steps), ground).figures
     of_batch = mosaic(survey, home / "batch").metrics["seam_disparity_px"]
     print("live: ", of_live)
     print("batch:", of_batch)

@@ -6,8 +6,9 @@ import time
 import pytest
 
 from skyquilt.alignment.progress import STEPS, AdjustmentSteps
-from skyquilt.engine.clock import apart
+from skyquilt.engine.clock import CountedParts, apart
 from skyquilt.engine.kept import Keep
+from skyquilt.engine.workers import Ahead, Telling, Threads
 
 
 def all_of(steps):
@@ -100,3 +101,42 @@ def test_adjustments_are_counted_by_their_parts():
     again = [step(f"turned 0 [] {name}") for name in ("start", "rough fixed 0", "outcome")]
     assert [f[:2] for f in again] == [(n, 2 * n), (n + 2, 2 * n), (2 * n - 1, 2 * n)]
     assert again[1][2] == "rough adjustment, 1, adjustment 2"
+
+
+def test_counted_parts_add_up_over_their_series():
+    step = CountedParts()
+    names = ["0 0", "coarse heights 1 of 2", "coarse heights 2 of 2", "(0, 1) coarse 0 512"]
+    names += ["(0, 1) fine heights 1 of 3", "fine 0 512", "(0, 9) fine heights 3 of 3"]
+    assert [step(name) for name in names] == [
+        (0, 1, ""),
+        (0, 2, "coarse heights"),
+        (1, 2, "coarse heights"),
+        (1, 2, "coarse heights"),
+        (2, 5, "fine heights"),
+        (2, 5, "fine heights"),
+        (4, 5, "fine heights"),
+    ]
+
+
+@pytest.mark.parametrize("number", [1, 3])
+def test_results_that_are_waited_for_are_told_and_can_be_left(number):
+    heard = []
+    telling = Telling(Threads(number), heard.append, "photos")
+    assert list(telling.each(abs, iter([-1, -2, -3]))) == [1, 2, 3]
+    assert heard == ["photos 1 of 3", "photos 2 of 3", "photos 3 of 3"]
+
+    def left(part):
+        if part == "photos 2 of 3":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        list(Telling(Threads(number), left, "photos").each(abs, [-1, -2, -3]))
+
+
+def test_what_is_computed_ahead_is_told_when_it_is_waited_for():
+    heard = []
+    ahead = Ahead(Threads(2), abs, [("a", -1), ("b", -2), ("c", -3)], heard.append, "pairs")
+    assert ahead.take("a", -1) == 1
+    assert ahead.take("c", -3) == 3  # b is passed over
+    assert ahead.take("d", -4) == 4  # made here
+    assert heard == ["pairs 1 of 3", "pairs 2 of 3", "pairs 3 of 3"]

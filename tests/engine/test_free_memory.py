@@ -65,3 +65,33 @@ print(subprocess.run([sys.executable, "-c", {inner!r}], capture_output=True, tex
 """
     told = subprocess.run([sys.executable, "-c", outer], capture_output=True, text=True, check=True)
     assert 10 < float(told.stdout) < 300
+
+
+ONE_POOL = """
+import ctypes, sys, threading
+from skyquilt.engine.free_memory import keep_one_pool
+
+libc = ctypes.CDLL(None)
+libc.fopen.restype = ctypes.c_void_p
+
+def pools():
+    file = ctypes.c_void_p(libc.fopen(sys.argv[1].encode(), b"w"))
+    libc.malloc_info(0, file)
+    libc.fclose(file)
+    return open(sys.argv[1]).read().count("<heap ")
+
+if sys.argv[2] == "one":
+    keep_one_pool()
+thread = threading.Thread(target=lambda: [bytearray(60_000) for _ in range(100)])
+thread.start()
+thread.join()
+print(pools())
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other libraries have no pools")
+@pytest.mark.parametrize(("asked", "found"), [("one", "1"), ("none", "2")])
+def test_threads_share_one_pool(tmp_path, asked, found):
+    words = [sys.executable, "-c", ONE_POOL, str(tmp_path / "info.xml"), asked]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == found

@@ -1,5 +1,6 @@
 """One photo that fails, whatever the error, is left out; the rest goes on, after a restart too."""
 
+import errno
 import json
 import os
 import shutil
@@ -14,8 +15,8 @@ import pytest
 import rasterio
 
 from skyquilt.engine.lock import FolderLock
-from skyquilt.errors import OutputError
-from skyquilt.live import folder_watch
+from skyquilt.errors import NoPhotosError, OutputError
+from skyquilt.live import final_map, folder_watch, workflow
 from skyquilt.live.folder_watch import Watch
 from skyquilt.live.inbox import Inbox
 from skyquilt.live.ledger import Ledger
@@ -23,6 +24,7 @@ from skyquilt.live.live_map import LiveMap
 from skyquilt.live.photo_intake import Intake, Refused
 from skyquilt.live.settings import LiveSettings
 from skyquilt.live.workflow import iter_live
+from skyquilt.model.event import Note
 from tests.attacks import SHARED, jpeg, needs_attacks
 
 QUICK = LiveSettings(features=600)
@@ -269,6 +271,139 @@ def test_what_was_reported_while_the_inbox_is_away_is_taken_when_it_is_back(tmp_
     assert box.look(0.3) == []  # the reports are read now
     (tmp_path / "away").rename(box.folder)
     assert len(box.look(2.0, photos=3)) == 3
+
+
+def test_an_inbox_that_the_system_does_not_answer_for_is_waited_for(tmp_path, monkeypatch):
+    """As of a network that is gone: what asks for the folder gets another error than of one that is
+    missing.
+    """
+    box = Box(tmp_path)
+    real = Path.is_dir
+
+    def unanswered(path, **words):
+        if path == box.folder:
+            raise OSError(errno.ENOTCONN, "Transport endpoint is not connected", str(path))
+        return real(path, **words)
+
+    monkeypatch.setattr(Path, "is_dir", unanswered)
+    assert box.look(0.3) == []
+    monkeypatch.undo()
+    (box.folder / "b.jpg").write_bytes(jpeg(96, 80))
+    assert len(box.look(2.5, photos=1)) == 1
+
+
+def run_until(live, inbox, done, seconds=60):
+    """Notes of a live map that runs until `done()`."""
+    stop = threading.Event()
+    timer = threading.Timer(seconds, stop.set)
+    timer.start()
+    notes = []
+    for happened in iter_live([inbox], live, stop=stop):
+        if isinstance(happened, Note):
+            notes.append(happened.text)
+        if done(notes):
+            stop.set()
+    timer.cancel()
+    return notes
+
+
+def test_an_inbox_that_goes_away_is_told_once_and_when_it_is_back(tmp_path, monkeypatch):
+    inbox = tmp_path / "in"
+    inbox.mkdir()
+    live = LiveMap(tmp_path / "out", QUICK)
+    rounds = iter(range(1000))
+
+    def moved(folder, *rest):
+        if (n := next(rounds)) == 20:
+            inbox.rename(tmp_path / "away")
+        elif n == 60:
+            (tmp_path / "away").rename(inbox)
+        return real(folder, *rest)
+
+    real = workflow._away
+    monkeypatch.setattr(workflow, "_away", moved)
+    notes = run_until(live, inbox, lambda _: next(rounds, 1000) > 200, 10)
+    live.close()
+    assert notes == [
+        f"{inbox} cannot be found or read; no photo arrives from there until it is back",
+        f"{inbox} is there again",
+    ]
+
+
+def test_a_disk_that_stays_full_is_told_once(tmp_path, monkeypatch):
+    inbox = tmp_path / "in"
+    inbox.mkdir()
+    live = LiveMap(tmp_path / "out", QUICK)
+    failing = iter([OutputError("the disk is full")] * 5 + [None] * 3 + [OutputError("again")] * 2)
+
+    def work():
+        if (error := next(failing, None)) is not None:
+            raise error
+
+    monkeypatch.setattr(workflow, "FULL_S", 0.0)
+    monkeypatch.setattr(live, "work", work)
+    notes = run_until(live, inbox, lambda _: next(failing, 0) == 0, 10)
+    live.close()
+    assert notes == ["the disk is full", "again"]
+
+
+def stored(live):
+    """The stored file of each photo by its name."""
+    rows = live.ledger.rows("select name, file from photo")
+    return {str(n): live.folder / "photos" / str(f) for n, f in rows}
+
+
+def test_a_stored_photo_that_is_lost_is_told_and_taken_again(flight, tmp_path):
+    """From its folder at the next start; sent by HTTP, when it is sent again."""
+    inbox = tmp_path / "in"
+    inbox.mkdir()
+    for path in flight.photos[:4]:
+        shutil.copy(path, inbox)
+    live = taken(tmp_path / "out", inbox, 4)
+    assert live.ledger.counts().get("refused") == 0
+    first, second = (p.name for p in flight.photos[:2])
+    stored(live)[first].unlink()
+    stored(live)[second].write_bytes(b"")
+    (inbox / second).unlink()
+    live.close()
+
+    live = LiveMap(tmp_path / "out", QUICK)
+    reasons = refused(live)
+    assert set(reasons) == {first, second} and live.ledger.counts()["refused"] == 2
+    told = [json.loads(b) for _, kind, b in live.ledger.told(0) if kind == "photo"][-2:]
+    assert {(b["name"], b["state"]) for b in told} == {(first, "refused"), (second, "refused")}
+    live.close()
+
+    live = LiveMap(tmp_path / "out", QUICK)
+    run_until(live, inbox, lambda _: set(refused(live)) == {second})
+    assert set(refused(live)) == {second}
+    done = live.intake.take(iter([flight.photos[1].read_bytes()]), second, "drone")
+    assert not done.duplicate and live.ledger.counts()["refused"] == 0
+    for _ in live.drain_all():
+        pass
+    states = {str(n): str(s) for n, s in live.ledger.rows("select name, state from photo")}
+    assert len(states) == 4 and set(states.values()) <= {"placed", "refined"}
+    again = live.intake.take(iter([flight.photos[1].read_bytes()]), second, "drone")
+    assert again.duplicate and again.id == done.id
+    live.close()
+
+
+def test_the_final_map_names_photos_whose_files_are_gone(flight, tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(final_map, "iter_mosaic", lambda paths, *_, **__: seen.append(paths) or ())
+    live = LiveMap(tmp_path / "out", QUICK)
+    for path in flight.photos[:3]:
+        live.intake.take_file(path, "drone")
+    gone = flight.photos[1].name
+    stored(live)[gone].unlink()
+    (note,) = final_map.iter_finish(live.folder, QUICK)
+    assert note.warning and gone in note.text and "without them" in note.text
+    assert [p.stem for p in seen[0]] == [p.stem for p in flight.photos[:3] if p.name != gone]
+    for path in stored(live).values():
+        path.unlink(missing_ok=True)
+    with pytest.raises(NoPhotosError, match="all photos are gone"):
+        list(final_map.iter_finish(live.folder, QUICK))
+    live.close()
 
 
 def test_two_live_maps_on_one_folder_are_refused(tmp_path):

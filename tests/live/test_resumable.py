@@ -2,6 +2,7 @@
 
 import base64
 import errno
+import logging
 import os
 import socket
 import time
@@ -311,3 +312,22 @@ def test_only_those_who_may_write_upload(tmp_path):
         assert other.create(1000).status_code == 403
         assert other.ask("DELETE", place).status_code == 403
         assert Client(site.web).offset(place) == 0
+
+
+def test_a_server_that_ends_keeps_the_bytes_that_arrived(flight, tmp_path, caplog):
+    """Without a traceback; the upload goes on when it is back."""
+    data = flight.photos[0].read_bytes()
+    with served(tmp_path / "out", QUICK, guard=Guard(upload_stall_s=60.0)) as site:
+        client = Client(site.web)
+        place = begun(client, len(data))
+        raw = cut_off(site, place, 0, data[:1000], len(data))
+        site.until(lambda: "another request" in client.patch(place, 999, b"x").text)
+        time.sleep(0.5)
+    raw.settimeout(10)
+    assert raw.recv(100)[:12] == b"HTTP/1.1 408"
+    raw.close()
+    assert [r.getMessage() for r in caplog.records if r.levelno >= logging.ERROR] == []
+    with served(tmp_path / "out", QUICK) as site:
+        client = Client(site.web)
+        assert client.offset(place) == 1000
+        assert client.send(place, data, 1000).headers["photo-state"] == "received"

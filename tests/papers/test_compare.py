@@ -119,3 +119,24 @@ def test_killed_between_methods_the_same_command_goes_on(flight, tmp_path, undis
     assert "pose: mosaic" not in again.stdout
     assert "bundle: mosaic" in again.stdout
     assert Path(out / "report.html").is_file()
+
+
+@pytest.mark.slow
+def test_a_comparison_that_is_replaced_leaves_no_columns(flight, tmp_path):
+    """They would stand beside those of other photos; what somebody else put there stays."""
+    out = tmp_path / "out"
+    two = replace(SETTINGS, variants=("position", "pose"), first=4)
+    compared(flight / "photos", out, settings=two)
+    (out / "position" / "mine.txt").write_text("mine")
+    (out / "bundle").mkdir()  # no run
+    (out / "bundle" / "notes.txt").write_text("mine")
+    one = replace(two, variants=("image",), first=3)
+    assert isinstance(list(iter_compare(flight / "photos", out, one, overwrite=True))[-1], Result)
+    assert {p.name for p in out.iterdir() if p.is_dir()} == {
+        ".skyquilt",
+        "image",
+        "position",
+        "bundle",
+    }
+    assert [p.name for p in (out / "position").iterdir()] == ["mine.txt"]
+    assert [p.name for p in (out / "bundle").iterdir()] == ["notes.txt"]

@@ -1,9 +1,11 @@
 import json
+import math
 from dataclasses import replace
 from datetime import datetime
 
 import pyproj
 import pytest
+from pyproj import Geod
 
 from skyquilt.alignment.setup import intrinsic_priors
 from skyquilt.errors import SideFileError
@@ -16,7 +18,7 @@ from skyquilt.photos.side_files import apply_positions, read_geo_txt, read_mrk, 
 from skyquilt.photos.side_rows import PhotoNames, SideRow, apply_rows
 from skyquilt.photos.srt import read_srt
 
-from .conftest import dji_exif, dji_xmp
+from .conftest import dji_exif, dji_xmp, gps_exif
 
 
 def written(tmp_path, text, name="side.txt"):
@@ -190,6 +192,48 @@ def test_mrk_moves_the_antenna_to_the_camera(tmp_path):
         read_mrk(tmp_path / "t.MRK", ["IMG_1.JPG"])
 
 
+MRK = "".join(
+    f"{k}\t1.0\t[2120]\t0,N\t0,E\t0,V\t46.{k}000,Lat\t-92.0,Lon\t92,Ellh\t0.01, 0.01, 0.02\t50,Q\n"
+    for k in (1, 2)
+)
+
+
+def flights(make_jpeg, *names):
+    return [
+        replace(read_photo(make_jpeg(n, exif=dji_exif(), seed=k)), name=n)
+        for k, n in enumerate(names)
+    ]
+
+
+def test_shots_of_a_flight_are_not_given_to_another(tmp_path, make_jpeg):
+    """Numbers begin anew with each flight: those beside the file are meant."""
+    photos = flights(make_jpeg, "a/DJI_0001.JPG", "a/DJI_0002.JPG", "b/DJI_0001.JPG")
+    (after, notes) = apply_positions(photos, written(tmp_path, MRK, "a/t.MRK"))
+    assert [p.position.latitude_deg for p in after] == [
+        pytest.approx(46.1),
+        pytest.approx(46.2),
+        photos[2].position.latitude_deg,
+    ]
+    assert notes[0] == "t.MRK placed 2 of 3 photos." and "b/DJI_0001.JPG" in notes[1]
+    with pytest.raises(SideFileError, match="one flight, and both a/DJI_0001.JPG and b/DJI_0001"):
+        apply_positions(photos, written(tmp_path, MRK, "t.MRK"))
+    (after, _) = apply_positions(photos[1:], tmp_path / "t.MRK")  # no number twice: both are of it
+    assert [p.position.latitude_deg for p in after] == [pytest.approx(46.2), pytest.approx(46.1)]
+
+
+def test_photos_of_one_shot_in_several_bands_have_its_place(tmp_path, make_jpeg):
+    photos = flights(make_jpeg, "DJI_0001_W.JPG", "DJI_0001_T.JPG")
+    (after, _) = apply_positions(photos, written(tmp_path, MRK, "t.MRK"))
+    assert [p.position.latitude_deg for p in after] == [pytest.approx(46.1)] * 2
+
+
+def test_frames_of_two_videos_do_not_share_a_telemetry(tmp_path, make_jpeg):
+    photos = flights(make_jpeg, "a/frame_0001.JPG", "b/frame_0001.JPG")
+    photos = [replace(p, time=None) for p in photos]
+    with pytest.raises(SideFileError, match=r"one flight, and both a/frame_0001.JPG and b/"):
+        read_srt(written(tmp_path, NEW, "a.srt"), photos)
+
+
 NEW = """1
 00:00:00,000 --> 00:00:00,033
 <font size="28">FrameCnt: 1, DiffTime: 33ms
@@ -357,6 +401,10 @@ def test_decimal_commas_and_separators_of_spreadsheets_give_the_same_position(tm
     [
         ("name,lat,lon,alt [ft]\nDJI_0001,46,9,700\n", r"'alt \[ft\]' is in ft"),
         ("name,lat (rad),lon\nDJI_0001,0.8,0.1\n", "is in rad"),
+        ("name,lat,lon,alt_ft\nDJI_0001,46,9,700\n", "'alt_ft' is in ft"),
+        ("name,lat,lon,Altitude (US survey feet)\nDJI_0001,46,9,700\n", "is in ussurveyfeet"),
+        ("name,lat,lon,height [m or ft]\nDJI_0001,46,9,700\n", "is in ft"),
+        ("name,alt,lat,lon\nDJI_0001,210,5,46.25,9.5\n", "row 1 has 5 cells, and the header 4"),
         ("name,lat,lon\n", "a header only"),
         ("name;lat;lon;alt\nDJI_0001;46.25;9.5;1,210\n", "found '1,210'"),
     ],
@@ -372,3 +420,103 @@ def test_two_rows_of_one_photo_that_differ_are_refused(tmp_path, photo):
         apply_positions([photo], written(tmp_path, head + row + "dji_0001 9.1 46 100\n"))
     ((after,), _) = apply_positions([photo], written(tmp_path, head + row + row))
     assert after.position.longitude_deg == pytest.approx(9)
+
+
+HERE = (46.5, -92.0)
+"""Where `dji_exif` places its photo."""
+
+
+def minutes(degrees):
+    whole = int(degrees)
+    return whole + (degrees - whole) * 0.6
+
+
+@pytest.mark.parametrize(
+    ("lat", "lon", "words"),
+    [
+        (14.3, 46.5, "exchanged"),
+        (math.radians(HERE[0]), math.radians(HERE[1]), "its degrees are radians"),
+        (minutes(46.5), minutes(-92.9), "degrees and minutes"),
+        (HERE[0], HERE[1] + 6, "its UTM zone is 1 too high"),
+        (HERE[0], HERE[1] - 12, "its UTM zone is 2 too low"),
+    ],
+)
+def test_positions_that_a_mistake_of_the_file_explains_are_refused(
+    tmp_path, make_jpeg, lat, lon, words
+):
+    there = {"exchanged": (46.5, 14.3), "degrees and minutes": (46.5, -92.9)}.get(words, HERE)
+    photo = read_photo(make_jpeg("DJI_0001.JPG", exif=dji_exif(GPS=gps_exif(*there))))
+    with pytest.raises(SideFileError, match=words):
+        apply_positions([photo], written(tmp_path, f"EPSG:4326\nDJI_0001 {lon} {lat}\n"))
+
+
+@pytest.mark.parametrize(("east", "south"), [(0.02, 1), (0, -1)])
+def test_positions_elsewhere_without_a_known_mistake_are_told_and_used(
+    tmp_path, photo, east, south
+):
+    """Files without hemispheres are mended by such a file."""
+    lat, lon = HERE[0] * south, HERE[1] + east
+    side = written(tmp_path, f"EPSG:4326\nDJI_0001 {lon} {lat}\n")
+    ((after,), notes) = apply_positions([photo], side)
+    assert after.position.latitude_deg == pytest.approx(lat)
+    (told,) = [n for n in notes if "km from where" in n]
+    km = Geod(ellps="WGS84").inv(lon, lat, HERE[1], HERE[0])[2] / 1000
+    stated = float(told.split("photos ")[1].split(" km")[0].replace(",", ""))
+    assert stated == pytest.approx(km, rel=0.01, abs=0.6)
+
+
+def test_positions_of_a_better_receiver_are_not_compared_aloud(tmp_path, photo):
+    side = written(tmp_path, f"EPSG:4326\nDJI_0001 {HERE[1] + 0.0005} {HERE[0]} 199\n")
+    (_, notes) = apply_positions([photo], side)
+    assert notes == ("side.txt placed 1 of 1 photos.",)
+
+
+@pytest.mark.parametrize(("height", "told"), [(198.3 / 0.3048, True), (230.0, False)])
+def test_heights_that_look_like_feet_are_told(tmp_path, photo, height, told):
+    side = written(tmp_path, f"EPSG:4326\nDJI_0001 {HERE[1]} {HERE[0]} {height}\n")
+    (_, notes) = apply_positions([photo], side)
+    assert any("may be in feet" in n for n in notes) == told
+
+
+@pytest.mark.parametrize(
+    ("system", "metres", "told"),
+    [
+        ("EPSG:26915+5703", 1.0, False),
+        ("EPSG:26915+6360", 1200 / 3937, False),
+        ("EPSG:2264", 1.0, True),
+        ("EPSG:26915", 1.0, False),
+    ],
+)
+def test_heights_have_the_unit_that_the_coordinate_system_states(tmp_path, system, metres, told):
+    gcp = written(tmp_path, f"{system}\n500000 5100000 650 4 5 DJI_0001.JPG a\n")
+    ((point,), notes) = read_gcp_list(gcp, ["DJI_0001.JPG"])
+    assert point.z == pytest.approx(650 * metres, abs=1e-9)
+    assert any("taken as metres" in n for n in notes) == told
+    (row,) = read_geo_txt(written(tmp_path, f"{system}\nDJI_0001 500000 5100000 650\n"))
+    assert row.altitude_m == pytest.approx(650 * metres, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "line", ["DJI_0001 446,358.5 5,160,926.2 440", "DJI_0001 446,358,100 5,160,926,200 440"]
+)
+def test_thousands_are_not_read_as_separate_numbers(tmp_path, line):
+    with pytest.raises(SideFileError, match="line 2: expected 'name x y"):
+        read_geo_txt(written(tmp_path, f"EPSG:32615\n{line}\n"))
+
+
+def test_there_are_sixty_zones(tmp_path):
+    """EPSG:32661, the next code, is a projection of the pole."""
+    with pytest.raises(SideFileError, match="no UTM zone 61"):
+        read_geo_txt(written(tmp_path, "WGS84 UTM 61N\nDJI_0001 446358 5160926\n"))
+
+
+def test_a_table_says_what_it_gave(tmp_path, photo):
+    with pytest.raises(SideFileError, match="no photo a position or angles"):
+        apply_positions([photo], written(tmp_path, "name,x,y,z\nDJI_0001,1,2,3\n", "a.csv"))
+    (_, notes) = apply_positions(
+        [photo], written(tmp_path, "name,x,y,yaw\nDJI_0001,1,2,90\n", "a.csv")
+    )
+    assert notes == (
+        "a.csv gave 1 of 1 photos their angles, and placed none.",
+        "a.csv has columns that are not read: x, y.",
+    )

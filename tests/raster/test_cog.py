@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from rasterio.enums import MaskFlags
 from scipy.ndimage import distance_transform_edt
 
-from skyquilt.raster import CogWriter, write_array
+from skyquilt.errors import UsageError
+from skyquilt.raster import CogWriter, RasterSpec, write_array
 from skyquilt.raster.codecs import FADED_RIM, KEPT_RIM, smooth_fill
 
 from .raster_cases import PLACE, assert_valid_cog, disc, picture, psnr, read, spec_for
@@ -247,3 +248,86 @@ def test_mistakes_state_both_sides(tmp_path):
         writer.finish_block(next(writer.blocks()))
     assert not (tmp_path / "a.tif").exists()
     assert [path.name for path in Path(tmp_path).iterdir()] == ["b.tif"]
+
+
+WAVES = picture(60, 50, 1)[..., 0]
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "int16", "float32"])
+@pytest.mark.parametrize(
+    "laid",
+    [
+        np.asfortranarray,
+        lambda a: np.repeat(a, 2, 1)[:, ::2],
+        lambda a: a[::-1, ::-1].copy()[::-1, ::-1],
+        lambda a: a.astype(a.dtype.newbyteorder(">")),
+        lambda a: a[..., None],
+        lambda a: np.ma.array(a),
+        np.ndarray.tolist,
+    ],
+    ids=["columns first", "every other", "backwards", "big endian", "a band", "unmasked", "lists"],
+)
+def test_arrays_of_any_layout_give_the_same_file(tmp_path, laid, dtype):
+    array = WAVES.astype(dtype)
+    array.flags.writeable = False
+    known = laid(array)
+    known = np.array(known, dtype) if isinstance(known, list) else known
+    write_array(tmp_path / "a.tif", array, spec_for(array))
+    write_array(tmp_path / "b.tif", known, spec_for(array))
+    assert (tmp_path / "a.tif").read_bytes() == (tmp_path / "b.tif").read_bytes()
+    with rasterio.open(tmp_path / "b.tif") as source:
+        assert np.array_equal(source.read(1), array)
+
+
+@pytest.mark.parametrize(
+    ("array", "valid", "words"),
+    [
+        (np.ones((120, 100), np.uint8), None, "array is"),  # it had been cropped
+        (WAVES.T, None, "array is"),
+        (WAVES[:0], None, "array is"),
+        (WAVES.ravel(), None, "array is"),
+        (np.dstack([WAVES] * 3), None, "array is"),
+        (WAVES.astype(float), None, "array is"),
+        (WAVES.astype(np.int64), None, "array is"),
+        (WAVES > 9, None, "array is"),
+        (WAVES.astype(object), None, "array is"),
+        (None, None, "array is"),
+        (np.ma.array(WAVES, mask=WAVES > 99), None, "array has masked"),
+        (WAVES, np.ones((5, 5), bool), "valid is"),
+        (WAVES, np.ones((120, 100), bool), "valid is"),
+        (WAVES, WAVES, "valid is"),
+        (WAVES, True, "valid is"),
+    ],
+)
+def test_arrays_that_are_not_as_the_specification_are_refused(tmp_path, array, valid, words):
+    with pytest.raises(ValueError, match=words):
+        write_array(tmp_path / "a.tif", array, spec_for(WAVES), valid)
+    assert not list(tmp_path.iterdir())
+
+
+NOT_MEANT = {
+    "width": [0, -1, 1.5, "40", None, np.nan, True],
+    "height": [0, 10.5, np.array([3, 4])],
+    "bands": [0, 1.5, "x"],
+    "dtype": ["float64", "nonsense", None, np.float32],
+    "transform": [None, (1, 2, 3), (0,) * 6, (np.nan,) * 6, "abcdef", (1, 1, 0, 1, 1, 0), 5],
+    "crs": ["EPSG:0", "", "nonsense", 5, "x" * 10_000],
+    "vertical": ["EPSG:5773", -1, 0, 1.5],
+    "nodata": ["x", [1]],
+    "compress": ["zip", None, "JPEG"],
+    "quality": [0, -1, 101, 1e9, "x", 1.5, np.inf],
+    "overviews": ["sum", None],
+    "tile": [0, 15, 2**20, "x", 512.5],
+    "band_names": ["a", [1], 5, ("a", "b")],
+    "band_units": ["m", ("m", "m")],
+    "mask": ["yes", 5, None],
+}
+
+
+@pytest.mark.parametrize(("name", "value"), [(n, v) for n, vs in NOT_MEANT.items() for v in vs])
+def test_specifications_that_cannot_be_meant_are_refused_by_name(name, value):
+    """Such a `quality` or `transform` had made a file."""
+    known = {"width": 40, "height": 30, "bands": 1, "dtype": "uint8", "transform": PLACE}
+    with pytest.raises((ValueError, UsageError), match=name) as refused:
+        RasterSpec(**known | {name: value})
+    assert len(str(refused.value)) < 300

@@ -4,7 +4,11 @@ import io
 import json
 import os
 import shutil
+import socket
+import socketserver
+import threading
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -326,3 +330,41 @@ def test_control_points_from_the_list_to_the_residuals(browser, site, flight, ru
     page.locator("#residuals").scroll_into_view_if_needed()
     shot(page, "residuals")
     assert page.errors == []
+
+
+class Prefixed(socketserver.StreamRequestHandler):
+    """A reverse proxy that shows a server below /map/, and knows nothing else."""
+
+    def handle(self):
+        head = [self.rfile.readline()]
+        while head[-1] not in (b"\r\n", b""):
+            head.append(self.rfile.readline())
+        method, path, version = head[0].split(b" ")
+        if not path.startswith(b"/map/"):
+            self.wfile.write(b"HTTP/1.1 404 Not Found\r\nConnection: close\r\n\r\n")
+            return
+        kept = [line for line in head[1:-1] if not line.lower().startswith(b"connection:")]
+        asked = b" ".join([method, path.removeprefix(b"/map"), version])
+        with socket.create_connection(self.server.behind) as behind:
+            behind.sendall(b"".join([asked, *kept, b"Connection: close\r\n\r\n"]))
+            while data := behind.recv(1 << 16):
+                self.wfile.write(data)
+
+
+def test_the_page_works_below_a_path_of_a_reverse_proxy(browser, site):
+    """Nothing is asked for beside that path."""
+    proxy = socketserver.ThreadingTCPServer(("127.0.0.1", 0), Prefixed)
+    proxy.daemon_threads, proxy.block_on_close = True, False
+    proxy.behind = (urlsplit(site).hostname, urlsplit(site).port)
+    threading.Thread(target=proxy.serve_forever, daemon=True).start()
+    here = f"http://127.0.0.1:{proxy.server_address[1]}"
+    page = opened(browser, f"{here}/map/")
+    page.mouse.click(*middle(page))
+    page.wait_for_selector("#covering img")
+    assert page.errors == []
+    assert any("/map/tiles/" in url for url in page.asked)
+    assert [u for u in page.asked if not u.startswith((f"{here}/map/", "data:", "blob:"))] == []
+    assert np.ptp(seen(page), axis=(0, 1)).max() > 100  # the map is drawn
+    page.context.close()
+    proxy.shutdown()
+    proxy.server_close()

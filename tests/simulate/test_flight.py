@@ -1,6 +1,7 @@
 """Plans have the overlap asked for; what is reported has the errors asked for."""
 
-from dataclasses import replace
+import math
+from dataclasses import fields, is_dataclass, replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ from skyquilt.simulate import prepare, preset
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.flight import fly, plan
 from skyquilt.simulate.reported import Start, place_at, report_all
-from skyquilt.simulate.settings import Reporting, Route
+from skyquilt.simulate.settings import FlightSettings, Reporting, Route, Thermal, Video
+from skyquilt.simulate.strip import StripSettings
 
 LENS = Lens()
 START = Start(base=440.0, takeoff=1.5)
@@ -115,3 +117,60 @@ def test_settings_that_do_not_fit():
         prepare(replace(preset("demo"), route=Route(overlap=1.2)))
     with pytest.raises(UsageError, match="no preset 'x'"):
         preset("x")
+
+
+def numbers(record, way=()):
+    """Where a record, or those in it, hold numbers that are not whole."""
+    for known in fields(record):
+        value = getattr(record, known.name)
+        if is_dataclass(value):
+            yield from numbers(value, (*way, known.name))
+        elif "float" in str(known.type) and "tuple" not in str(known.type):
+            yield (*way, known.name)
+
+
+def changed(record, way, value):
+    first, *rest = way
+    return replace(
+        record, **{first: changed(getattr(record, first), rest, value) if rest else value}
+    )
+
+
+FULL = replace(FlightSettings(), thermal=Thermal(), video=Video())
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("settings", [FULL, StripSettings()], ids=["flight", "strip"])
+def test_every_number_must_be_one(settings, value):
+    ways = list(numbers(settings))
+    assert len(ways) > 5
+    for way in ways:
+        with pytest.raises(UsageError, match=f"^{way[-1].replace('_', ' ')} must be a number"):
+            changed(settings, way, value).checked()
+
+
+@pytest.mark.parametrize(
+    ("part", "values"),
+    [
+        ("route", {"height": 1e9}),
+        ("route", {"heading": 1e9}),
+        ("reporting", {"gps_noise": 1e9}),
+        ("reporting", {"gps_noise_z": -1.0}),
+        ("reporting", {"altitude_drift": -1e9}),
+        ("reporting", {"focal_error": 1e9}),
+        ("pictures", {"exposure_noise": 1e9}),
+    ],
+)
+def test_absurd_numbers_are_refused(part, values):
+    """They had taken the machine, ended in words of Python, or gave photos of nothing."""
+    settings = replace(
+        FlightSettings(), **{part: replace(getattr(FlightSettings(), part), **values)}
+    )
+    with pytest.raises(UsageError, match=next(iter(values)).split("_")[0].replace("gps", "GPS")):
+        settings.checked()
+
+
+@pytest.mark.parametrize("settings", [FULL, StripSettings()], ids=["flight", "strip"])
+def test_a_seed_is_not_negative(settings):
+    with pytest.raises(UsageError, match="seed must not be negative"):
+        replace(settings, seed=-1).checked()

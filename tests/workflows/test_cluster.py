@@ -1,5 +1,7 @@
 """A map made by several processes, one of which dies in each stage, is that of one process."""
 
+import time
+
 import psutil
 import pytest
 
@@ -27,7 +29,9 @@ def test_the_same_map_though_a_worker_dies_in_each_stage(flight, finished, tmp_p
     killed = set()
     for event in iter_mosaic("photos", tmp_path / "out", settings):
         if isinstance(event, StageProgress) and event.stage not in killed:
-            victims = workers()
+            deadline = time.monotonic() + 60  # the one killed before may be the last, and come back
+            while not (victims := workers()) and time.monotonic() < deadline:
+                time.sleep(0.1)
             assert victims, "no process works for this run"
             victims[0].kill()
             killed.add(event.stage)

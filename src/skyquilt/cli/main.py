@@ -72,9 +72,11 @@ def run() -> None:
     try:
         _checked(sys.argv[1:])
         with interrupt.ends_at_once():
+            from skyquilt.engine.free_memory import keep_one_pool
             from skyquilt.engine.memory_watch import enough_addresses
 
             enough_addresses(1)  # before libraries are loaded that crash
+            keep_one_pool()  # before they start threads
             from skyquilt.cli.app import app
         try:
             app()

@@ -1,5 +1,6 @@
 """Time per stage, reported as events."""
 
+import re
 import sys
 import threading
 import time
@@ -73,6 +74,31 @@ def apart(work: Callable[[Callable[[str], None]], T], step: Callable[[str], Step
     result = found.result()
     yield last[1], last[1]
     return result
+
+
+_COUNTED = re.compile(r"([^\W\d][^\d]*?) ?([0-9]+) of ([0-9]+)$")
+
+
+@dataclass(kw_only=True)
+class CountedParts:
+    """Counts parts that are named `heights 3 of 40`: the third of forty begins. Several series,
+    told apart by their words, follow one another.
+    """
+
+    what: str = ""
+    """The words of the last part."""
+    at: tuple[int, int] = (0, 1)
+    """Done and total of its series."""
+    before: int = 0
+    """Parts of earlier series."""
+
+    def __call__(self, part: str) -> Step:
+        """Done, total, and what is done now; a part without numbers changes nothing."""
+        if found := _COUNTED.search(part):
+            if found[1] != self.what and self.what:
+                self.before += self.at[1]
+            self.what, self.at = found[1], (int(found[2]) - 1, int(found[3]))
+        return self.before + self.at[0], self.before + self.at[1], self.what
 
 
 def _progress(stage: str, done: int, total: int, what: str = "") -> StageProgress:

@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -190,11 +190,10 @@ def open_run(
             )
         (path / STATE).mkdir(parents=True, exist_ok=True)
         lock = FolderLock(path, f"{STATE}/{LOCK}", "run")
-        if taken and not grows:
-            for name in (*CONTRACT, *FILES, error_log.NAME):  # none may stay beside another map
-                (path / name).unlink(missing_ok=True)
-        if taken:
-            shutil.rmtree(path / EXPORTS, ignore_errors=True)  # of the map that is replaced
+        if taken and grows:
+            shutil.rmtree(path / EXPORTS, ignore_errors=True)
+        elif taken:
+            _remove_files(path)
         probe = path / STATE / "probe"
         probe.write_bytes(b"x")
         probe.unlink()
@@ -204,6 +203,32 @@ def open_run(
     if was.state != "done" or was.key != key:
         folder.mark("running")
     return folder
+
+
+def remove_run(path: Path) -> None:
+    """Removes what a run wrote to its folder, and the folder if nothing else is in it; a folder
+    without a run stays.
+
+    Raises:
+        OutputError: another run works in it, or it cannot be removed.
+    """
+    if not _known(path).key:
+        return
+    lock = FolderLock(path, f"{STATE}/{LOCK}", "run")
+    try:
+        _remove_files(path)
+        lock.close()
+        shutil.rmtree(path / STATE)
+    except OSError as error:
+        raise refusal(path, error) from error
+    with suppress(OSError):  # it holds files of others
+        path.rmdir()
+
+
+def _remove_files(path: Path) -> None:
+    for name in (*CONTRACT, *FILES, error_log.NAME):  # none may stay beside another map
+        (path / name).unlink(missing_ok=True)
+    shutil.rmtree(path / EXPORTS, ignore_errors=True)  # of the map that is replaced
 
 
 def _other(was: _Known) -> str:

@@ -25,12 +25,24 @@ _least = [0]
 
 
 def return_large_blocks() -> None:
-    """Asks the C library to return large blocks at once, and to keep few separate pools. Other C
-    libraries than glibc do that by themselves.
+    """Asks the C library to return large blocks at once, and to keep one pool. Other C libraries
+    than glibc do that by themselves.
     """
+    keep_one_pool()
+    _ask((_MMAP, LARGE_BYTES), (_TRIM, 16 * LARGE_BYTES))
+
+
+def keep_one_pool() -> None:
+    """Asks the C library for one pool of memory for all threads: what one thread freed serves the
+    others. Without effect once there is another thread.
+    """
+    _ask((_ARENAS, 1))
+
+
+def _ask(*wanted: tuple[int, int]) -> None:
     with suppress(OSError, AttributeError, TypeError):
         library = ctypes.CDLL(None)
-        for parameter, value in (_MMAP, LARGE_BYTES), (_TRIM, 16 * LARGE_BYTES), (_ARENAS, 2):
+        for parameter, value in wanted:
             library.mallopt(ctypes.c_int(parameter), ctypes.c_int(value))
 
 

@@ -83,16 +83,58 @@ HERE = Threads()
 """One thread: that of the caller."""
 
 
+@dataclass(frozen=True)
+class Telling:
+    """Workers of which each result that is waited for is told."""
+
+    workers: Workers
+    """Who computes."""
+    tell: Callable[[str], None]
+    """Hears `what 3 of 40`; it may end the work by raising."""
+    what: str
+    """What is computed."""
+
+    @property
+    def apart(self) -> bool:
+        """As of the workers."""
+        return self.workers.apart
+
+    @property
+    def handed(self) -> int:
+        """As of the workers."""
+        return self.workers.handed
+
+    def each(self, work: Callable[[A], B], items: Iterable[A]) -> Iterator[B]:
+        """work(item) for each item, in order."""
+        items = list(items)
+        found = self.workers.each(work, items)
+        for number in range(len(items)):
+            self.tell(f"{self.what} {number + 1} of {len(items)}")
+            yield next(found)
+
+    def news(self) -> Sequence[Note]:
+        """As of the workers."""
+        return self.workers.news()
+
+
 class Ahead(Generic[A, B]):
     """Results of items in a known order, computed while the caller does something else with the
     ones before.
     """
 
     def __init__(
-        self, workers: Workers, work: Callable[[A], B], items: Sequence[tuple[Hashable, A]]
+        self,
+        workers: Workers,
+        work: Callable[[A], B],
+        items: Sequence[tuple[Hashable, A]],
+        tell: Callable[[str], None] = lambda _: None,
+        what: str = "part",
     ) -> None:
-        """`items`: by a name each, in the order in which `take` will ask for them."""
-        self._work = work
+        """`items`: by a name each, in the order in which `take` will ask for them. `tell` hears
+        which of them is waited for, as `what 3 of 40`.
+        """
+        self._work, self._tell, self._what = work, tell, what
+        self._total = len(items)
         self._names = deque(name for name, _ in items)
         self._results = workers.each(work, [item for _, item in items])
 
@@ -100,9 +142,12 @@ class Ahead(Generic[A, B]):
         """The result of the next item of this name; computed here if none is to come."""
         if name not in self._names:  # the first one nearly always
             return self._work(item)
-        while self._names.popleft() != name:
-            next(self._results)
-        return next(self._results)
+        while True:
+            self._tell(f"{self._what} {self._total - len(self._names) + 1} of {self._total}")
+            asked = self._names.popleft() == name
+            result = next(self._results)
+            if asked:
+                return result
 
 
 @contextmanager

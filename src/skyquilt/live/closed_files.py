@@ -8,7 +8,7 @@ import struct
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from skyquilt.outside import walk
+from skyquilt.outside import is_folder, walk
 
 CLOSE_WRITE, MOVED_TO, CREATE, IS_DIR, OVERFLOW = 0x8, 0x80, 0x100, 0x40000000, 0x4000
 IGNORED = 0x8000
@@ -59,7 +59,7 @@ class ClosedFiles:
         """
         closed: set[str] = set()
         everything = False
-        if self._lost and self.folder.is_dir():
+        if self._lost and is_folder(self.folder):
             self._lost, everything = not self._watch(str(self.folder)), True
         while data := self._read():
             at = 0
@@ -71,7 +71,7 @@ class ClosedFiles:
                 if mask & IGNORED and self._folders.pop(number, "") == str(self.folder):
                     self._lost = True  # the folder was removed, or its disk
                 if mask & IS_DIR:
-                    self.told &= self._watch(path) or not Path(path).is_dir()
+                    self.told &= self._watch(path) or not is_folder(Path(path))
                 everything |= bool(mask & (IS_DIR | OVERFLOW))
                 if mask & (CLOSE_WRITE | MOVED_TO) and not mask & IS_DIR:
                     closed.add(path)

@@ -12,7 +12,9 @@ from skyquilt.errors import NoPhotosError
 from skyquilt.live.ledger import Ledger
 from skyquilt.live.live_map import FINISHED, PHOTOS
 from skyquilt.live.settings import LiveSettings
-from skyquilt.model.event import Event
+from skyquilt.model.event import Event, Note
+from skyquilt.outside import is_file
+from skyquilt.photos.side_rows import sentence_of
 from skyquilt.settings import MosaicSettings
 from skyquilt.workflows.mosaic import iter_mosaic
 
@@ -36,7 +38,17 @@ def iter_finish(folder: Path, settings: LiveSettings) -> Iterator[Event]:
         ledger.close()
     if not rows:
         raise NoPhotosError(f"{folder} holds no accepted photo; there is nothing to finish")
-    paths = named(folder, [(int(i), str(n), str(f)) for i, n, f in rows])
+    paths, lost = named(folder, [(int(i), str(n), str(f)) for i, n, f in rows])
+    if lost:
+        yield Note(
+            text=f"the files of {len(lost)} accepted photos are gone from {folder / PHOTOS}; the"
+            f" final map is made without them: {sentence_of(lost)}",
+            warning=True,
+        )
+    if not paths:
+        raise NoPhotosError(
+            f"all photos are gone from {folder / PHOTOS}; there is nothing to finish"
+        )
     wanted = MosaicSettings(
         features=settings.features,
         crs=settings.crs,
@@ -52,16 +64,19 @@ def iter_finish(folder: Path, settings: LiveSettings) -> Iterator[Event]:
     yield from iter_mosaic(paths, folder / FINISHED, wanted, overwrite=True, stays=True)
 
 
-def named(folder: Path, photos: list[tuple[int, str, str]]) -> list[Path]:
-    """Makes links to accepted photos (number, name, file). The link names are safe as file names
-    and contain the names under which the photos were sent.
+def named(folder: Path, photos: list[tuple[int, str, str]]) -> tuple[list[Path], list[str]]:
+    """Makes links to accepted photos (number, name, file), and names those whose files are gone.
+    The link names are safe as file names and contain the names under which the photos were sent.
     """
     home = folder / NAMED
     shutil.rmtree(home, ignore_errors=True)
     home.mkdir()
     taken: set[str] = set()
-    paths = []
+    paths, lost = [], []
     for number, name, file in photos:
+        if not is_file(folder / PHOTOS / file):
+            lost.append(name)
+            continue
         stem = re.sub(r"[^A-Za-z0-9_-]", "_", Path(name).stem)[:80].strip("_") or "photo"
         plain = f"{stem}{Path(file).suffix}"
         if plain.lower() in taken:
@@ -73,4 +88,4 @@ def named(folder: Path, photos: list[tuple[int, str, str]]) -> list[Path]:
         except OSError:  # a file system without hard links
             shutil.copyfile(folder / PHOTOS / file, target)
         paths.append(target)
-    return paths
+    return paths, lost

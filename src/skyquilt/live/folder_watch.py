@@ -13,7 +13,7 @@ from skyquilt.live.inbox import ending_of, is_clip
 from skyquilt.live.ledger import hit
 from skyquilt.live.photo_intake import Accepted, Intake, Refused
 from skyquilt.model.photo import RejectedPhoto
-from skyquilt.outside import open_regular, same_folder, walk
+from skyquilt.outside import is_folder, open_regular, same_folder, walk
 from skyquilt.photos.read import read_photo
 from skyquilt.photos.survey import RUN_MARKS
 
@@ -94,7 +94,7 @@ class Watch:
     _due: float = 0.0
 
     def __post_init__(self) -> None:
-        if not self.folder.is_dir():
+        if not is_folder(self.folder):
             raise UsageError(
                 f"{self.folder} is not a folder; make it, or name the folder for the photos"
             )
@@ -187,7 +187,7 @@ class Watch:
         """Files to check, with their stamp; None if the file no longer exists."""
         reported = {p for p in map(Path, closed) if _photo_name(p.name) and not self._of_a_run(p)}
         known = reported | set(map(Path, self.growing))
-        if not self.folder.is_dir():
+        if not is_folder(self.folder):
             self._due = 0.0  # what was reported while it is away is looked for when it is back
         elif everything or now >= self._due:
             began = time.thread_time()  # a busy machine is no reason to look less often
@@ -216,7 +216,7 @@ class Watch:
         return False
 
     def _cannot(self, folder: Path, error: OSError) -> None:
-        if folder.is_dir():  # not one that is gone by now
+        if is_folder(folder):  # not one that is gone by now
             self._closed_folders[folder] = error.strerror or str(error)
 
     def _unfinished(self, path: Path, *, patient: bool) -> str:

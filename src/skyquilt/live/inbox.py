@@ -42,6 +42,8 @@ class Arrived:
     """BLAKE2b hash of its content (hex)."""
     size: int
     """Size in bytes."""
+    anew: bool = True
+    """Whether the folder had no whole file of this content."""
 
 
 def ending_of(head: bytes) -> str | None:
@@ -104,6 +106,7 @@ class Inbox:
                 os.fsync(file.fileno())
             hit("photo file synced")
             path = self.folder / (digest.hexdigest() + ending)
+            anew = _size(path) != size
             partial.replace(path)
             synced(self.folder)
             hit("photo file named")
@@ -113,7 +116,7 @@ class Inbox:
         except BaseException:
             gone(partial)
             raise
-        return Arrived(path=path, digest=digest.hexdigest(), size=size)
+        return Arrived(path=path, digest=digest.hexdigest(), size=size, anew=anew)
 
 
 def _read(blocks: Iterable[bytes]) -> Iterator[bytes]:
@@ -122,6 +125,14 @@ def _read(blocks: Iterable[bytes]) -> Iterator[bytes]:
         yield from blocks
     except OSError as error:
         raise UnreadablePhotoError(f"it cannot be read ({error.strerror or error})") from error
+
+
+def _size(path: Path) -> int | None:
+    """Size in bytes; None if there is no such file."""
+    try:
+        return path.stat().st_size
+    except OSError:
+        return None
 
 
 def synced(folder: Path) -> None:

@@ -10,6 +10,7 @@ the process there.
 """
 
 import json
+import os
 import re
 import sqlite3
 import threading
@@ -246,6 +247,29 @@ class Ledger:
             )
             self.tell("refused", {"name": name, "source": source, "reason": reason})
 
+    def forget_refused(self, digest: str) -> None:
+        """Forgets a photo that is refused, and whose file was gone until it arrived again, so that
+        it counts as new.
+        """
+        with self.change() as db:
+            own = "in (select id from photo where digest = ? and state = 'refused')"
+            db.execute(f"delete from link where a {own} or b {own}", (digest, digest))
+            db.execute(f"delete from photo where id {own}", (digest,))
+
+    def lost(self, photo: int, name: str, source: str, reason: str) -> None:
+        """Refuses a photo whose stored file cannot be read any more. Where it came from a folder,
+        it is taken from there again.
+        """
+        with self.change() as db:
+            self.set_photo(photo, state="refused", reason=reason, pose=None, footprint="")
+            db.execute("update link set body = null where a = ? or b = ?", (photo, photo))
+            db.execute(
+                "delete from seen where path = ? or substr(path, -length(?) - 1) = ? || ?",
+                (name, name, os.sep, name),
+            )
+            said = {"id": photo, "name": name, "source": source, "state": "refused"}
+            self.tell("photo", {**said, "time": None, "reason": reason})
+
     def set_photo(self, photo: int, **columns: Any) -> None:
         """Changes columns of a photo; dicts and lists become JSON."""
         names = ", ".join(f"{k} = ?" for k in columns)
@@ -254,12 +278,13 @@ class Ledger:
             db.execute(f"update photo set {names} where id = ?", (*values, photo))
 
     def counts(self) -> dict[str, int]:
-        """Number of photos by state, including `refused`."""
+        """Number of photos by state, including `refused`: photos, and files that became none."""
         found = {
             str(s): int(n) for s, n in self.rows("select state, count(*) from photo group by state")
         }
         refused = self.row("select count(*) from refused")
-        return {**found, "refused": int(refused[0]) if refused else 0}
+        files = int(refused[0]) if refused else 0
+        return {**found, "refused": found.get("refused", 0) + files}
 
     def put_links(self, links: Sequence[tuple[int, int, bytes | None]]) -> None:
         """Stores links (a < b); None = the pair was compared and does not match."""

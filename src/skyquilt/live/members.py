@@ -170,7 +170,8 @@ class Members:
                 most_mp=self.settings.most_mp,
             )
             if isinstance(photo, RejectedPhoto):
-                self.ledger.set_photo(number, state="refused", reason=photo.reason)
+                if state != "refused":
+                    self.ledger.lost(int(number), str(name), str(source), photo.reason)
                 continue
             try:
                 known = pose_from(json.loads(pose)) if pose else None

@@ -125,6 +125,8 @@ class Intake:
         return Refused(name=name, reason=reason)
 
     def _enter(self, arrived: Arrived, name: str, source: str) -> Accepted | Refused:
+        if arrived.anew:
+            self.ledger.forget_refused(arrived.digest)
         known = self.ledger.row("select id, name from photo where digest = ?", arrived.digest)
         if known is not None:
             return Accepted(id=int(known[0]), name=str(known[1]), duplicate=True)

@@ -15,11 +15,13 @@ from skyquilt.live.events import Update
 from skyquilt.live.fill import iter_fill
 from skyquilt.live.final_map import iter_finish
 from skyquilt.live.folder_watch import Watch
+from skyquilt.live.ledger import Ledger
 from skyquilt.live.live_map import PHOTOS, LiveMap
 from skyquilt.live.photo_intake import Refused
 from skyquilt.live.settings import LiveSettings
 from skyquilt.live.uploaded_clips import UploadedClips
 from skyquilt.model.event import Event, Note, Result
+from skyquilt.outside import is_folder
 
 IDLE_S = 0.01
 """Pause in s between checks when there is nothing to do."""
@@ -54,14 +56,19 @@ def iter_live(
     watches.append(UploadedClips(intake=live.intake))
     busy_since = time.monotonic()
     filled = not fill
+    away, failing = set[Path](), ""
     while not stop.is_set():
         try:
+            yield from _away(folders, away, live.ledger)
             yield from _taken(watches)
             update = live.work()
         except (OutputError, sqlite3.Error) as error:
-            yield Note(text=str(error), warning=True)
+            if str(error) != failing:  # once, however long a disk is full
+                failing = str(error)
+                yield Note(text=failing, warning=True)
             stop.wait(FULL_S)
             continue
+        failing = ""
         if update is not None:
             busy_since = time.monotonic()
             filled = filled and not (fill and update.what == "placed")
@@ -78,6 +85,21 @@ def iter_live(
         if live.ledger.meta("finish") == "asked" and not growing:
             yield from _finished(live, live.settings)
         stop.wait(IDLE_S)
+
+
+def _away(folders: Sequence[Path], away: set[Path], ledger: Ledger) -> Iterator[Event]:
+    """Tells once where a folder of photos is gone, such as one on a disk or in a network, and when
+    it is back; `away` are those that were gone.
+    """
+    for folder in folders:
+        if is_folder(folder) == (folder not in away):
+            continue
+        away ^= {folder}
+        text = f"{folder} is there again"
+        if folder in away:
+            text = f"{folder} cannot be found or read; no photo arrives from there until it is back"
+        ledger.tell("note", {"text": text})
+        yield Note(text=text, warning=folder in away)
 
 
 def _taken(watches: Sequence[Watch | UploadedClips]) -> Iterator[Event]:

@@ -182,7 +182,7 @@ class Balance:
         usable = [v for v in views if v.photo in thumbnails]
         if len(usable) < 2:
             return NEUTRAL
-        samples = self._samples(usable, thumbnails, surface, bounds)
+        samples = self._samples(usable, thumbnails, surface, bounds, keep)
         if not len(samples.point):
             return NEUTRAL
         where = np.array([v.footprint.mean(0) for v in usable])
@@ -320,6 +320,7 @@ class Balance:
         thumbnails: Mapping[int, NDArray[np.uint8]],
         surface: Surface,
         bounds: tuple[float, float, float, float],
+        keep: Keep = MADE_NOW,
     ) -> "Samples":
         west, south, east, north = bounds
         area, each = (east - west) * (north - south), POINTS * len(views)
@@ -331,6 +332,7 @@ class Balance:
         z = surface.at(x, y)
         point, row, place, value = [], [], [], []
         for index, view in enumerate(views):
+            keep.tell(f"brightness {index + 1} of {len(views)}")
             part = _around(view, x[0], y[:, 0])
             if 0 in x[part].shape:  # it shows none of a small area
                 continue

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.engine.clock import Steps
+from skyquilt.engine.clock import CountedParts, Steps, apart
 from skyquilt.engine.kept import Keep
 from skyquilt.engine.store import Store, digest
 from skyquilt.engine.workers import HERE, Workers
@@ -147,9 +147,9 @@ def find_ground(
             *((find_blanks, sorted(see_through)) if blanks else ()),
             *(() if grows is None else grows.key),
         )
-        keep, tied = store.parts("surface", key, workers), [v for v in views if v.photo in held]
+        tied = [v for v in views if v.photo in held]
 
-        def refined() -> Surface:
+        def refined(keep: Keep) -> Surface:
             if grows is None:
                 return known if sweep is None else sweep(known, tied, grid, grey, keep)
 
@@ -161,7 +161,11 @@ def find_ground(
 
             return grows.surface(grid, made)
 
-        surface = store.get_or("surface", key, refined)
+        def told(tell: Callable[[str], None]) -> Surface:
+            keep = replace(store.parts("surface", key, workers), told=tell)
+            return store.get_or("surface", key, lambda: refined(keep))
+
+        surface = yield from apart(told, CountedParts())
         views = tuple(make_views(alignment, surface, limits))
     yield 1, 1
     return Ground(

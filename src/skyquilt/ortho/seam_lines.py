@@ -122,7 +122,7 @@ class SeamLines:
         tiles = {f"{box[0]} {box[1]}": box for box in _boxes((0, 0, *z.shape), TILE)}
         missing = keep.missing(tiles)
         boxes = [(box, box) for tile in missing for box in _boxes(tiles[tile], PART)]
-        ahead = Ahead(keep.workers, compared, boxes)
+        ahead = Ahead(keep.workers, compared, boxes, keep.tell, "seams")
         for tile, (row, column, h, w) in tiles.items():
             at = (slice(row, row + h), slice(column, column + w))
             photo[at], hidden[at] = keep(tile, lambda: self._tile(ahead, photo, tiles[tile]))  # noqa: B023 - called at once

@@ -279,7 +279,8 @@ def _fused(given: _Round, pairs: Sequence[tuple[Pair, Level]], name: str, keep: 
     for tile in missing:
         order += [k for k in near[tile] if k not in before]
         before = stays[tile]
-    ahead = Ahead(keep.workers, matched, [(k, pairs[k]) for k in order])
+    items = [(k, pairs[k]) for k in order]
+    ahead = Ahead(keep.workers, matched, items, keep.tell, f"{name} heights")
     held: dict[int, Cells] = {}
 
     def fused(tile: str) -> Float:

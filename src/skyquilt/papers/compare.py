@@ -13,7 +13,7 @@ import numpy as np
 
 from skyquilt.effects import MOSAIC, OF_METHODS, option_of, taken
 from skyquilt.engine.clock import Clock
-from skyquilt.engine.folder import STATE
+from skyquilt.engine.folder import STATE, remove_run
 from skyquilt.engine.store import Store, digest
 from skyquilt.errors import AlignmentError, UsageError
 from skyquilt.model.event import Event, Note, Result, StageFinished, StageProgress, StageStarted
@@ -142,6 +142,7 @@ def iter_compare(
             trusting = asked.changed(repair=False, detector=None, matcher=None, estimator=None)
             yield from rows.run(f"{name}-trusted", trusting)
     order = [n for v in settings.variants for n in (v, f"{v}-trusted") if n in rows.by_name]
+    _remove_others(output, order)
     names = [p.name for p in given.survey.photos]
     record = _record({n: rows.by_name[n] for n in order}, names, says, folder)
     if base.input.distances is None:
@@ -151,6 +152,15 @@ def iter_compare(
     state.done = True
     state.write(output)
     yield Result(output=output, metrics=record)
+
+
+def _remove_others(output: Path, columns: Sequence[str]) -> None:
+    """Removes what an earlier comparison left in the folder: columns that this one does not have,
+    perhaps of other photos.
+    """
+    for name in (n for v in VARIANTS for n in (v, f"{v}-trusted")):
+        if name not in columns:
+            remove_run(output / name)
 
 
 class _Rows:

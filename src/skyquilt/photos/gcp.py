@@ -1,9 +1,9 @@
 """OpenDroneMap's `gcp_list.txt`: a coordinate system, then `x y z px py image [name] [check]`.
 
 Rows with the same name, or without names the same x, y and z, are observations of one point. z may
-be NaN; a compound or three-dimensional coordinate system states its zero. Pixels have their centres
-at integers. A check point, which is not used in the adjustment, has a name that starts with `check`
-or the word `check` in the eighth column: OpenDroneMap ignores both extensions.
+be NaN; a compound or three-dimensional coordinate system states its zero and its unit. Pixels have
+their centres at integers. A check point, which is not used in the adjustment, has a name that
+starts with `check` or the word `check` in the eighth column: OpenDroneMap ignores both extensions.
 """
 
 import math
@@ -16,17 +16,20 @@ from typing import TYPE_CHECKING
 from skyquilt.errors import SideFileError
 from skyquilt.model.photo import ControlPoint, Datum, Photo, PointObservation
 from skyquilt.outside import plain
-from skyquilt.photos.side_rows import PhotoNames, finite, number, read_crs, read_lines, sentence_of
+from skyquilt.photos.elsewhere import FAR_KM, apart_km
+from skyquilt.photos.side_rows import (
+    PhotoNames,
+    finite,
+    metres_of_height,
+    number,
+    read_crs,
+    read_lines,
+    sentence_of,
+    unit_notes,
+)
 
 if TYPE_CHECKING:
     from pyproj import CRS
-
-
-FAR_KM = 50.0
-"""Distance of control points from all photos that no flight explains: another coordinate system, or
-x and y swapped.
-"""
-_KM_PER_DEGREE = 111.32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +65,8 @@ def read_gcp_list(
         )
     crs = read_crs(lines[0][1], file=path.name)
     epsg = crs.to_epsg()
-    observations = [_observation(text, f"{path.name}, line {i}") for i, text in lines[1:]]
+    unit_m = metres_of_height(crs)
+    observations = [_observation(text, f"{path.name}, line {i}", unit_m) for i, text in lines[1:]]
     names = PhotoNames(photo_names)
     strangers = sorted({s.image for s in observations if names.find(s.image) is None})
     if all(names.find(s.image) is None for s in observations):
@@ -78,7 +82,8 @@ def read_gcp_list(
     points = [
         _point(i, group, system, zero, names, path) for i, group in enumerate(groups.values(), 1)
     ]
-    return tuple(p for p in points if p.observations), _notes(path, strangers, points)
+    notes = (*_notes(path, strangers, points), *unit_notes(path, crs, [p.z for p in points]))
+    return tuple(p for p in points if p.observations), notes
 
 
 def datum_of(crs: "CRS") -> Datum:
@@ -104,7 +109,7 @@ def _notes(path: Path, strangers: list[str], points: list[ControlPoint]) -> tupl
     return tuple(n for n in (missing, lost) if n)
 
 
-def _observation(line: str, place: str) -> _Observation:
+def _observation(line: str, place: str, unit_m: float) -> _Observation:
     words = line.split("\t") if line.count("\t") >= 5 else line.split()
     words = [w.strip() for w in words if w.strip()]
     numbers = [number(w) for w in words[:5]]
@@ -120,7 +125,7 @@ def _observation(line: str, place: str) -> _Observation:
     return _Observation(
         x=x or 0.0,
         y=y or 0.0,
-        z=finite(z),
+        z=None if finite(z) is None else z * unit_m,
         column=column or 0.0,
         row=row or 0.0,
         image=words[5],
@@ -192,17 +197,10 @@ def _check_places(path: Path, control: Sequence[ControlPoint], photos: Sequence[
                 f"{path.name}: {plain(point.name, 80)} at ({point.x:g}, {point.y:g}) is no place in"
                 f" {plain(control[0].crs, 60)}. Correct the point or the coordinate system."
             )
-        away.append(min(_apart_km(latitude, longitude, *there) for there in flown))
+        away.append(min(apart_km((latitude, longitude), there) for there in flown))
     if median(away) > FAR_KM:
         raise SideFileError(
             f"{path.name}: its points are {median(away):.0f} km from the photos. Correct the"
             " coordinate system in its first line, or the order of x (east) and y (north); where"
             " the photos' positions are wrong, give others with --geo."
         )
-
-
-def _apart_km(latitude: float, longitude: float, other_lat: float, other_lon: float) -> float:
-    """About the distance of two places given in degrees."""
-    turn = (longitude - other_lon + 180) % 360 - 180
-    shrink = math.cos(math.radians((latitude + other_lat) / 2))
-    return _KM_PER_DEGREE * math.hypot(latitude - other_lat, turn * shrink)

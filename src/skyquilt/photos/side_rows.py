@@ -3,15 +3,17 @@
 import csv
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
+from string import ascii_lowercase
 from typing import TYPE_CHECKING
 
 from skyquilt.errors import SideFileError
 from skyquilt.geometry.frames import belly_from_gimbal
 from skyquilt.model.photo import Attitude, Datum, GeoPosition, Photo
 from skyquilt.outside import plain, read_bounded, real, text_of
+from skyquilt.photos.elsewhere import check_heights, check_positions
 from skyquilt.photos.metadata import why_void
 
 _LOOKS_DOWN_AT_MINUS_90 = -45.0
@@ -69,6 +71,48 @@ class PhotoNames:
         return None
 
 
+def of_one_flight(
+    names: Sequence[str], shots: Sequence[int | None], *, file: str, beside: Collection[str] = ()
+) -> list[int | None]:
+    """The number of each photo's shot in a file of one flight, None for photos of others: numbers
+    begin anew with each flight. Where several photos have one, those that lie `beside` the file
+    are meant; `names`: of all photos.
+
+    Raises:
+        SideFileError: that does not tell which are meant.
+    """
+    if (twice := _claimed_twice(names, shots)) is None:
+        return list(shots)
+    near = [s if n in beside else None for n, s in zip(names, shots, strict=True)]
+    if any(s is not None for s in near) and _claimed_twice(names, near) is None:
+        return near
+    shot, a, b = twice
+    raise SideFileError(
+        f"{file} is of one flight, and both {plain(a, 80)} and {plain(b, 80)} have its number"
+        f" {shot}. Map the flights one by one, or give the positions of all photos in a CSV."
+    )
+
+
+def _claimed_twice(
+    names: Sequence[str], shots: Sequence[int | None]
+) -> tuple[int, str, str] | None:
+    """A shot that two photos of one kind have, and these; None where there is none."""
+    first: dict[tuple[int, str], str] = {}
+    for name, shot in zip(names, shots, strict=True):
+        if shot is None:
+            continue
+        before = first.setdefault((shot, _kind(name)), name)
+        if before != name:
+            return shot, before, name
+    return None
+
+
+def _kind(name: str) -> str:
+    """What tells photos of one shot apart: letters behind its number, and the ending."""
+    path = PurePosixPath(name.lower())
+    return path.stem[len(path.stem.rstrip(ascii_lowercase)) :] + path.suffix
+
+
 def sentence_of(names: Sequence[str]) -> str:
     """`a, b, c and 7 more`."""
     head = ", ".join(plain(name, 80) for name in names[:_SHOWN])
@@ -103,8 +147,19 @@ def apply_rows(
     _check(rows, file)
     changed = tuple(_override(p, found, source) for p in photos)
     without = [p.name for p in photos if p.name not in found]
+    rows_of = [found[p.name] for p in photos if p.name in found]
+    placed = sum(r.latitude_deg is not None for r in rows_of)
+    turned = sum(r.angles_deg is not None for r in rows_of)
+    if rows and not placed and not turned:
+        raise SideFileError(
+            f"{file.name} gives no photo a position or angles; expected latitude and longitude, or"
+            " yaw. Fill in its cells, or omit the file."
+        )
     notes = (
-        f"{file.name} placed {len(photos) - len(without)} of {len(photos)} photos.",
+        f"{file.name} placed {placed} of {len(photos)} photos." if placed else "",
+        f"{file.name} gave {turned} of {len(photos)} photos their angles, and placed none."
+        if not placed
+        else "",
         f"{file.name} names photos that are not in the survey: {sentence_of(strangers)}."
         if strangers
         else "",
@@ -112,7 +167,33 @@ def apply_rows(
         if without
         else "",
     )
-    return changed, tuple(n for n in notes if n)
+    return changed, (*(n for n in notes if n), *_compared(photos, found, file.name))
+
+
+def _compared(
+    photos: Sequence[Photo], found: Mapping[str | None, SideRow], file: str
+) -> Iterator[str]:
+    """Notes on rows that lie elsewhere than their photos say, or higher."""
+    both = [(p.position, found[p.name]) for p in photos if p.position and p.name in found]
+    pairs = [
+        ((p.latitude_deg, p.longitude_deg), (r.latitude_deg, r.longitude_deg))
+        for p, r in both
+        if r.latitude_deg is not None and r.longitude_deg is not None
+    ]
+    yield from check_positions(file, [own for own, _ in pairs], [there for _, there in pairs])
+    heights = [(_height(p, r.datum), r.altitude_m) for p, r in both]
+    known = [(own, there) for own, there in heights if own is not None and there is not None]
+    yield from check_heights(file, [own for own, _ in known], [there for _, there in known])
+
+
+def _height(position: GeoPosition, datum: Datum) -> float | None:
+    """A photo's own height in m from a zero; of sea level and ellipsoid, which differ by less than
+    a hundred metres, also the other one.
+    """
+    if datum == "takeoff":
+        return position.takeoff_m
+    absolute = (position.sea_level_m, position.ellipsoid_m)
+    return next((h for h in absolute if h is not None), None)
 
 
 def _check(rows: Sequence[SideRow], file: Path) -> None:
@@ -271,6 +352,8 @@ def read_crs(text: str, *, file: str) -> "CRS":
     found = _UTM.fullmatch(text.strip())
     if found:
         zone, south = int(found[1]), (found[2] or "N").upper() == "S"
+        if not 1 <= zone <= 60:  # the codes beside are those of the poles
+            raise SideFileError(f"{file}: there is no UTM zone {zone}, only 1 to 60. Correct it.")
         text = f"EPSG:{(32700 if south else 32600) + zone}"
     try:
         if len(text) > _MOST_CRS:
@@ -285,3 +368,31 @@ def read_crs(text: str, *, file: str) -> "CRS":
             " UTM 15N', "
             f"but it is '{plain(text, 100)}'. Add one."
         ) from error
+
+
+def metres_of_height(crs: "CRS") -> float:
+    """What one of a coordinate system's heights is in m, negative where they are depths; 1 where it
+    has none.
+    """
+    axes = crs.sub_crs_list[-1].axis_info if crs.is_compound else crs.axis_info[2:]
+    if not axes:
+        return 1.0
+    unit = float(axes[0].unit_conversion_factor) or 1.0
+    return -unit if axes[0].direction.lower() == "down" else unit
+
+
+def unit_notes(path: Path, crs: "CRS", heights: Iterable[float | None]) -> tuple[str, ...]:
+    """A note where a coordinate system counts in another unit than m and tells nothing of
+    heights.
+    """
+    flat = not crs.is_compound and len(crs.axis_info) == 2 and not crs.is_geographic
+    unit = crs.axis_info[0] if crs.axis_info else None
+    if not flat or unit is None or abs(unit.unit_conversion_factor - 1) < 1e-9:
+        return ()
+    if all(h is None for h in heights):
+        return ()
+    return (
+        f"The coordinate system of {path.name} counts in {unit.unit_name} and has no heights: those"
+        " in the file are taken as metres. If they are not, name a vertical system, too (such as"
+        " EPSG:2264+6360, with heights in US survey feet), or convert them.",
+    )

@@ -13,7 +13,7 @@ from pathlib import Path
 from skyquilt.errors import SideFileError
 from skyquilt.geometry.frames import belly_from_gimbal
 from skyquilt.model.photo import Photo
-from skyquilt.photos.side_rows import SideRow
+from skyquilt.photos.side_rows import SideRow, of_one_flight
 from skyquilt.video.srt import Sample, read_samples
 
 _FRAME = re.compile(r"(?:^|frame|[_-])([0-9]{1,18})$", re.IGNORECASE)
@@ -39,7 +39,7 @@ def read_srt(path: Path, photos: Sequence[Photo]) -> tuple[SideRow, ...]:
             f"{path.name} contains no latitude and longitude; expected a DJI telemetry subtitle"
             " file."
         )
-    rows = _by_time(samples, photos) or _by_frame(samples, photos)
+    rows = _by_time(samples, photos) or _by_frame(samples, photos, path.name)
     if not rows:
         raise SideFileError(
             f"{path.name} has {len(samples)} positions, but neither capture times nor numbers at"
@@ -77,10 +77,12 @@ def _by_time(samples: list[_Sample], photos: Sequence[Photo]) -> tuple[SideRow, 
     return tuple(rows)
 
 
-def _by_frame(samples: list[_Sample], photos: Sequence[Photo]) -> tuple[SideRow, ...]:
+def _by_frame(samples: list[_Sample], photos: Sequence[Photo], file: str) -> tuple[SideRow, ...]:
     by_index = {s.index: s.row for s in samples}
-    numbers = [_FRAME.search(Path(p.name).stem) for p in photos]
-    rows = [by_index.get(int(n[1])) if n else None for n in numbers]
+    found = [_FRAME.search(Path(p.name).stem) for p in photos]
+    numbers = [None if n is None else int(n[1]) for n in found]
+    rows = [by_index.get(n) if n is not None else None for n in numbers]
     if any(row is None for row in rows):
         return ()
+    of_one_flight([p.name for p in photos], numbers, file=file)
     return tuple(replace(row, name=p.name) for row, p in zip(rows, photos, strict=True) if row)

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.engine.clock import Steps
 from skyquilt.engine.workers import HERE, Workers
 from skyquilt.imaging.nodes import View
 from skyquilt.imaging.plane import Patch, view_patch
@@ -58,11 +57,10 @@ def placement_quality(
     alpha: float,
     order: Sequence[int],
     workers: Workers = HERE,
-) -> Steps[dict[str, Any]]:
+) -> dict[str, Any]:
     """Replays the placements in the given order at one ground resolution, and measures known
     distances.
     """
-    yield 0, 1
     views = {v.photo: v for v in ground.views}
     order = tuple(i for i in order if i in views)
     wide = max(view.camera.width for view in ground.views)
@@ -81,7 +79,6 @@ def placement_quality(
         "correlation_with_map_of_photo": [finite(c) for c in seen.with_overview],
         "off_position_over_width": [finite(o) for o in off],
     }
-    yield 1, 1
     return figures
 
 

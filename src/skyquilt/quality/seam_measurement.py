@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.engine.clock import Steps
 from skyquilt.engine.workers import HERE, Workers
 from skyquilt.ortho.companions import Drawn
 from skyquilt.ortho.compose import Composer
@@ -40,9 +39,8 @@ class MeasuredSeams:
 
 def measure_seams(
     compose: Composer, drawn: Drawn, ground: Ground, workers: Workers = HERE
-) -> Steps[MeasuredSeams]:
+) -> MeasuredSeams:
     """Registers the two photos beside each other at points along all seams."""
-    yield 0, 1
     shown = used_photos(ground.views)
     views = {k + 1: next(v for v in ground.views if v.photo == i) for k, i in enumerate(shown)}
     points = seam_points(drawn.provenance, limit=SEAM_POINTS)
@@ -65,7 +63,6 @@ def measure_seams(
         share = cut_objects(drawn.provenance, drawn.provenance_grid, labels)
         looks["seam_cut_objects"] = None if share is None else round(share, 4)
         looks["hidden_m2"] = round(float(labels.hidden.sum()) * labels.cells.gsd**2, 1)
-    yield 1, 1
     return MeasuredSeams(report=report, figures=_figures(report), looks=looks, worst=tuple(worst))
 
 

@@ -250,8 +250,25 @@ def write_array(
     path: Path, array: NDArray[Any], spec: RasterSpec, valid: Valid | None = None
 ) -> None:
     """Writes a raster that fits in memory: (height, width, bands), or (height, width) for one
-    band.
+    band. `valid` (height, width): the pixels that have values.
+
+    Raises:
+        ValueError: one of both is not as the specification says.
     """
+    size = spec.height, spec.width
+    if isinstance(array, np.ma.MaskedArray) and np.ma.is_masked(array):
+        raise ValueError("array has masked pixels; give those that are not as `valid`")
+    array = np.asarray(array)
+    shapes = [(*size, spec.bands), *([size] if spec.bands == 1 else [])]
+    if array.shape not in shapes or array.dtype.newbyteorder("=") != np.dtype(spec.dtype):
+        raise ValueError(
+            f"array is {shapes[0]} of {spec.dtype}, got {array.shape} of {array.dtype}"
+        )
+    array = array.astype(spec.numpy_dtype, copy=False)
+    if valid is not None:
+        valid = np.asarray(valid)
+        if valid.shape != size or valid.dtype != np.bool_:
+            raise ValueError(f"valid is {size} of bool, got {valid.shape} of {valid.dtype}")
     with CogWriter(path, spec) as writer:
         for block in writer.blocks():
             rows = slice(block.row0, block.row0 + block.height)

@@ -3,12 +3,16 @@
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
+from skyquilt.typed import typed
+
 Compression = Literal["jpeg", "deflate", "zstd", "lzw", "none"]
 Resampling = Literal["average", "mode", "nearest", "max"]
+MOST_TILE = 8192
+"""Largest side of a tile in px."""
 DTYPES = ("uint8", "uint16", "uint32", "int16", "float32")
 
 
@@ -53,15 +57,34 @@ class RasterSpec:
     """Unit of each band, e.g. `m`."""
 
     def __post_init__(self) -> None:
+        typed(self)
+        for name, kinds in (("compress", Compression), ("overviews", Resampling)):
+            if getattr(self, name) not in get_args(kinds):
+                raise ValueError(
+                    f"{name} is one of {', '.join(get_args(kinds))}, got {getattr(self, name)!r}"
+                )
+        if not 1 <= self.quality <= 100:
+            raise ValueError(f"quality is 1 to 100, got {self.quality}")
+        if self.vertical is not None and self.vertical < 1:
+            raise ValueError(f"vertical is an EPSG code, got {self.vertical}")
+        if not _invertible(self.transform):
+            raise ValueError(
+                f"transform is six finite numbers that turn pixels into places, got"
+                f" {self.transform!r}"
+            )
+        if self.crs is not None and not _known(self.crs):
+            raise ValueError(
+                f"crs is a coordinate system such as EPSG:32615, got {self.crs[:100]!r}"
+            )
         if self.width < 1 or self.height < 1 or self.bands < 1:
             raise ValueError(
-                f"a raster needs at least 1 x 1 x 1, got {self.width} x {self.height} x"
+                f"width, height and bands are 1 or more, got {self.width} x {self.height} x"
                 f" {self.bands}"
             )
         if self.dtype not in DTYPES:
             raise ValueError(f"dtype is one of {', '.join(DTYPES)}, got {self.dtype}")
-        if self.tile < 16 or self.tile % 16:
-            raise ValueError(f"tile is a multiple of 16 px, got {self.tile}")
+        if not 16 <= self.tile <= MOST_TILE or self.tile % 16:
+            raise ValueError(f"tile is a multiple of 16 px up to {MOST_TILE}, got {self.tile}")
         if self.compress == "jpeg" and (self.dtype != "uint8" or self.bands not in (1, 3)):
             raise ValueError(f"JPEG takes 1 or 3 bands of uint8, got {self.bands} of {self.dtype}")
         if self.nodata is not None and self.compress == "jpeg":
@@ -107,6 +130,28 @@ class RasterSpec:
     def digest(self, salt: str = "") -> str:
         """Hex digest of the specification and of `salt`."""
         return hashlib.sha256(f"{self!r}|{salt}".encode()).hexdigest()
+
+
+def _invertible(transform: Sequence[float]) -> bool:
+    """Whether these are six numbers, or the nine of an `affine.Affine`, that can be inverted."""
+    try:
+        numbers = np.array(tuple(transform), float)
+    except (TypeError, ValueError):
+        return False
+    if numbers.shape not in ((6,), (9,)) or not np.isfinite(numbers).all():
+        return False
+    return bool(numbers[0] * numbers[4] != numbers[1] * numbers[3])
+
+
+def _known(crs: str) -> bool:
+    from pyproj import CRS  # it takes a while to load, and some rasters have none
+    from pyproj.exceptions import CRSError
+
+    try:
+        CRS.from_user_input(crs)
+    except CRSError:
+        return False
+    return True
 
 
 def _holds(dtype: np.dtype, value: float) -> bool:

@@ -198,17 +198,31 @@ def client_of(request: Request) -> str:
     return request.client.host if request.client else ""
 
 
+HEARD_S = 0.25
+"""How often in s a request that waits for data asks whether the server ends."""
+
+
 async def blocks_of(request: Request, patience_s: float) -> AsyncIterator[bytes]:
     """The blocks of a body as they arrive.
 
     Raises:
         TimeoutError: no data arrived for `patience_s`, or they arrive too slowly to be of use.
-        ClientDisconnect: the connection was lost.
+        ClientDisconnect: the connection was lost, or the server ends.
     """
     stream, began, size = request.stream(), time.monotonic(), 0
+    ending = request.app.state.ending
     while True:
-        async with asyncio.timeout(patience_s):
-            block = await anext(stream, None)
+        coming = asyncio.ensure_future(anext(stream, None))
+        until = time.monotonic() + patience_s
+        try:
+            while not (await asyncio.wait({coming}, timeout=HEARD_S))[0]:
+                if ending.is_set():
+                    raise ClientDisconnect
+                if time.monotonic() > until:
+                    raise TimeoutError
+            block = coming.result()
+        finally:
+            coming.cancel()
         if block is None:
             return
         size += len(block)

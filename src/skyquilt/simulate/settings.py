@@ -1,8 +1,9 @@
 """Settings of a simulated flight, as nested records."""
 
 import math
-from dataclasses import dataclass, field
-from typing import Literal
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any, Literal
 
 import numpy as np
 
@@ -72,6 +73,10 @@ class Route:
         off = 0.1 * self.wind * (1 + float(rng.normal()))
         to = math.radians(self.wind_from + 180)
         return off * math.sin(to), off * math.cos(to)
+
+
+MOST_M = 10_000.0
+"""Largest error in m of a reported place."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -250,11 +255,25 @@ class FlightSettings:
 
     def checked(self) -> "FlightSettings":
         """The settings unchanged; raises UsageError where values do not fit together."""
+        for name in not_finite(self):
+            raise UsageError(f"{name} must be a number, not nan or infinite")
         for rules in (_route_rules(self), _other_rules(self)):
             for holds, sentence in rules:
                 if not holds:
                     raise UsageError(sentence)
         return self
+
+
+def not_finite(record: Any, name: str = "") -> Iterator[str]:
+    """Names of the numbers in a record, and in those within it, that are NaN or infinite."""
+    if is_dataclass(record):
+        for known in fields(record):
+            yield from not_finite(getattr(record, known.name), known.name)
+    elif isinstance(record, tuple):
+        for value in record:
+            yield from not_finite(value, name)
+    elif isinstance(record, float) and not math.isfinite(record):
+        yield name.replace("_", " ")
 
 
 _Rules = list[tuple[bool, str]]
@@ -269,8 +288,13 @@ def _route_rules(settings: FlightSettings) -> _Rules:
         (0 <= route.overlap < 0.98, f"overlap must be 0 to 97 %, not {100 * route.overlap:.0f} %"),
         (0 <= route.sidelap < 0.98, f"sidelap must be 0 to 97 %, not {100 * route.sidelap:.0f} %"),
         (
-            route.height >= 25,
-            f"height must be at least 25 m (trees, houses), not {route.height:g} m",
+            25 <= route.height <= 20_000,
+            f"height must be at least 25 m (trees, houses) and at most 20 km, not {route.height:g}"
+            " m",
+        ),
+        (
+            -360 <= route.heading <= 360,
+            f"the heading must be -360 to 360 degrees, not {route.heading:g}",
         ),
         (route.height > 2 * relief, low),
         (0 < route.speed <= 60, f"speed must be above 0 and at most 60 m/s, not {route.speed:g}"),
@@ -304,6 +328,7 @@ def _other_rules(settings: FlightSettings) -> _Rules:
     hour, relief, control = settings.weather.hour, settings.scene.relief, settings.control
     reporting, pictures = settings.reporting, settings.pictures
     return [
+        (settings.seed >= 0, f"the seed must not be negative, not {settings.seed}"),
         (relief >= 0, f"relief must not be negative, not {relief:g} m"),
         (0 <= hour < 24, f"hour must be 0 to 24, not {hour:g}"),
         (
@@ -315,12 +340,23 @@ def _other_rules(settings: FlightSettings) -> _Rules:
             "numbers of control and check points must not be negative",
         ),
         (
-            reporting.gps_noise >= 0,
-            f"GPS noise must not be negative, not {reporting.gps_noise:g} m",
+            0 <= reporting.gps_noise <= MOST_M and 0 <= (reporting.gps_noise_z or 0) <= MOST_M,
+            f"GPS noise must be 0 to {MOST_M:g} m, not {reporting.gps_noise:g}"
+            + ("" if reporting.gps_noise_z is None else f" and {reporting.gps_noise_z:g}"),
+        ),
+        (
+            abs(reporting.altitude_drift) <= MOST_M,
+            f"altitude drift must be at most {MOST_M:g} m, not {reporting.altitude_drift:g}",
         ),
         (reporting.gps_missing >= 0, "the number of photos without position must not be negative"),
-        (reporting.focal_error > -0.9, "the error of the focal length must be above -90 %"),
-        (pictures.exposure_noise >= 0, "exposure noise must not be negative"),
+        (
+            -0.9 < reporting.focal_error <= 10,
+            "the error of the focal length must be above -90 % and at most 1000 %",
+        ),
+        (
+            0 <= pictures.exposure_noise <= 5,
+            f"exposure noise must be 0 to 5, not {pictures.exposure_noise:g}",
+        ),
         (
             0 <= pictures.vignetting <= 0.9,
             f"vignetting must be 0 to 90 %, not {100 * pictures.vignetting:.0f} %",

@@ -10,7 +10,7 @@ from skyquilt.errors import UsageError
 from skyquilt.simulate.camera import Lens, camera_rotation
 from skyquilt.simulate.flight import fly, plan
 from skyquilt.simulate.grid import Doubles
-from skyquilt.simulate.settings import Route
+from skyquilt.simulate.settings import Route, not_finite
 
 
 def _wide() -> Lens:
@@ -60,19 +60,22 @@ class StripSettings:
 
     def checked(self) -> "StripSettings":
         """The settings unchanged; raises UsageError where values do not fit together."""
+        for name in not_finite(self):
+            raise UsageError(f"{name} must be a number, not nan or infinite")
         rules = [
+            (self.seed >= 0, f"the seed must not be negative, not {self.seed}"),
             (2 <= self.photos <= 500, f"photos must be 2 to 500, not {self.photos}"),
             (
                 0.3 <= self.overlap <= 0.95,
                 f"overlap must be 30 to 95 %, not {100 * self.overlap:.0f} %",
             ),
-            (self.height >= 1, f"height must be at least 1 m, not {self.height:g} m"),
+            (1 <= self.height <= 20_000, f"height must be 1 m to 20 km, not {self.height:g} m"),
             (
                 0 <= 3 * self.relief <= self.height,
                 f"relief must be 0 to a third of the height, not {self.relief:g} m",
             ),
             (0 <= self.tilt <= 8, f"tilt must be 0 to 8 degrees, not {self.tilt:g}"),
-            (self.noise >= 0, f"noise must not be negative, not {self.noise:g} px"),
+            (0 <= self.noise <= 100, f"noise must be 0 to 100 px, not {self.noise:g} px"),
         ]
         for holds, sentence in rules:
             if not holds:

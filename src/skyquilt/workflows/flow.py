@@ -10,14 +10,13 @@ command gets at the photos and the ground of a finished map by the same steps.
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
 
 from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.motion import speeds_of
 from skyquilt.alignment.priors import choose_frame, priors
 from skyquilt.alignment.progress import AdjustmentSteps
 from skyquilt.alignment.repairs import priors_taken
-from skyquilt.engine.clock import Clock, Steps, apart
+from skyquilt.engine.clock import Clock, CountedParts, Steps, apart
 from skyquilt.engine.free_memory import give_back_growth
 from skyquilt.engine.pixel_cache import PixelCache, pixel_budget, resident_budget
 from skyquilt.engine.store import Store
@@ -52,7 +51,6 @@ from skyquilt.workflows.photo_features import (
 from skyquilt.workflows.second_look import connect
 from skyquilt.workflows.survey_input import SurveyInput
 
-T = TypeVar("T")
 ADJUSTED_GB, ADJUSTED_PHOTO_GB = 0.5, 0.00014
 """Memory in GB of an adjustment, and how much more for each photo (measured: docs/scale.md)."""
 ADJUSTING = "adjusting"
@@ -281,10 +279,15 @@ def draw_map(
     """
     alignment, first = aligned.alignment, aligned.photos[0]  # all are of one kind
     exposure = yield from clock.stage(
-        "balance", _at_once(lambda: _exposure(aligned, on, methods, settings.picture, clock.store))
+        "balance",
+        apart(
+            lambda tell: _exposure(aligned, on, methods, settings.picture, clock.store, tell),
+            CountedParts(),
+        ),
     )
     labels, labelled = yield from clock.stage(
-        "seams", _at_once(lambda: _labels(aligned, on, exposure, methods, clock))
+        "seams",
+        apart(lambda tell: _labels(aligned, on, exposure, methods, clock, tell), CountedParts()),
     )
     make_room(aligned.found, aligned.grey, aligned.links)
     parts = None
@@ -321,7 +324,12 @@ def _drawn(
 
 
 def _exposure(
-    aligned: AlignedPhotos, on: Ground, methods: Methods, picture: PictureSettings, store: Store
+    aligned: AlignedPhotos,
+    on: Ground,
+    methods: Methods,
+    picture: PictureSettings,
+    store: Store,
+    tell: Callable[[str], None],
 ) -> Exposure:
     """The photos' exposure, from their thumbnails."""
     first = aligned.photos[0]
@@ -333,7 +341,7 @@ def _exposure(
         balance=methods.balance,
         drift=methods.drift,
         settings=picture,
-        keep=store.parts("balance", key),
+        keep=replace(store.parts("balance", key), told=tell),
         mixed=any(p.saved_grey for p in aligned.photos),
         measured=first.channels != 3,  # one band may be temperatures, others are of several spectra
     )
@@ -341,7 +349,12 @@ def _exposure(
 
 
 def _labels(
-    aligned: AlignedPhotos, on: Ground, exposure: Exposure, methods: Methods, clock: Clock
+    aligned: AlignedPhotos,
+    on: Ground,
+    exposure: Exposure,
+    methods: Methods,
+    clock: Clock,
+    tell: Callable[[str], None],
 ) -> tuple[Labels | None, str]:
     """Which photo is shown where, and its key in the store; None for blending methods with a rule
     of their own.
@@ -349,7 +362,7 @@ def _labels(
     if methods.blend.seam_px is None:
         return None, ""
     key = labels_key(aligned.alignment, aligned.photos, on, exposure, methods)
-    keep = clock.store.parts("seams", key, clock.workers)
+    keep = replace(clock.store.parts("seams", key, clock.workers), told=tell)
     grows = on.growth
 
     def made(area: Bounds, part: Grid) -> Labels:
@@ -411,11 +424,3 @@ def _align(known: AlignmentInputs, key: str, methods: Methods, clock: Clock) -> 
     alignment = yield from apart(aligned, AdjustmentSteps())
     store.forget([ADJUSTING])
     return alignment
-
-
-def _at_once(work: Callable[[], T]) -> Steps[T]:
-    """Runs a stage as a single step."""
-    yield 0, 1
-    result = work()
-    yield 1, 1
-    return result

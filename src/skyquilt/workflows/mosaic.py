@@ -9,7 +9,7 @@ Start reading at `make_map`. Its steps are those of `skyquilt.workflows.flow`.
 
 import json
 import shutil
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,12 +19,12 @@ from skyquilt.alignment.contradicted_positions import contradictions
 from skyquilt.alignment.heights import height_figures
 from skyquilt.alignment.oblique_start import tilt_warnings
 from skyquilt.alignment.priors import stretch_warnings
-from skyquilt.engine.clock import Clock, Steps, result_of
+from skyquilt.engine.clock import Clock, CountedParts, apart, result_of
 from skyquilt.engine.error_log import log_error
 from skyquilt.engine.folder import STATE, RunFolder, open_run
 from skyquilt.engine.free_memory import give_back_growth, return_large_blocks
 from skyquilt.engine.store import Store, digest
-from skyquilt.engine.workers import Threads, Workers, workers_for
+from skyquilt.engine.workers import Telling, Threads, workers_for
 from skyquilt.errors import PhotoFailedError
 from skyquilt.model.event import Event, Note, Result
 from skyquilt.model.photo import RejectedPhoto
@@ -289,7 +289,9 @@ def _made(given: SurveyInput, make: _Making) -> Generator[Event, None, dict[str,
     if settings.input.write_frames:
         writing = write_frames(output, aligned.photos, aligned.pixels)
         yield from clock.stage("write frames", writing, keeps=False)
-    measuring = _measured(aligned, ground, drawn, settings, clock.workers)
+    measuring = apart(
+        lambda tell: _measured(aligned, ground, drawn, settings, clock, tell), CountedParts()
+    )
     seams, quality, tone = yield from clock.stage("measure", measuring, keeps=False)
     metrics = _metrics(aligned, ground, drawn, seams, tone, settings) | {"quality": quality}
     metrics |= added
@@ -343,14 +345,14 @@ def _measured(
     ground: Ground,
     map_: DrawnMap,
     settings: MosaicSettings,
-    workers: Workers,
-) -> Steps[tuple[MeasuredSeams, dict[str, Any], dict[str, Any] | None]]:
-    """Measures the seams, the agreement of the placed photos, and how evenly they show the same
-    ground.
-    """
-    seams = yield from measure_seams(map_.compose, map_.drawn, ground, workers)
+    clock: Clock,
+    tell: Callable[[str], None],
+) -> tuple[MeasuredSeams, dict[str, Any], dict[str, Any] | None]:
+    """Measures seams, the agreement of photos, and how evenly they show the same ground."""
+    telling = Telling(clock.workers, tell, "seams")
+    seams = measure_seams(map_.compose, map_.drawn, ground, telling)
     aligned.pixels.make_room()
-    quality = yield from placement_quality(
+    quality = placement_quality(
         aligned.photos,
         aligned.alignment,
         aligned.priors,
@@ -359,7 +361,7 @@ def _measured(
         aligned.given.distances,
         settings.hybrid.alpha,
         aligned.order,
-        workers,
+        replace(telling, what="agreement of photos"),
     )
     aligned.grey.make_room()
     thumbnails = aligned.found.thumbnails([v.photo for v in ground.views])

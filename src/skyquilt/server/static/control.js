@@ -10,7 +10,7 @@ const controlLayer = L.layerGroup().addTo(map);
 const readControl = async () => {
   if (!state.info || !state.info.control || control.read) return;
   control.read = true;
-  const said = await asked("/control");
+  const said = await asked("control");
   Object.assign(control, { crs: said.crs, points: said.points, marks: said.marks, run: said.run, photos: said.photos });
   $("control").hidden = false;
   drawControl();
@@ -20,7 +20,7 @@ const readControl = async () => {
 const handControl = async (file) => {
   if (!/\.(txt|csv)$/i.test(file.name) || !state.info.control) return false;
   try {
-    const said = await asked(`/control/read?crs=${encodeURIComponent(control.crs)}`, { method: "POST", body: file });
+    const said = await asked(`control/read?crs=${encodeURIComponent(control.crs)}`, { method: "POST", body: file });
     keepUndo();
     Object.assign(control, { crs: said.crs, points: said.points, marks: said.marks, chosen: null, open: true });
     drawControl();
@@ -51,7 +51,7 @@ const addForm = () => {
   const about = element("small", `Coordinates in ${control.crs}.`), pick = button("Take from the map", () => {
     state.picking = state.picking ? null : async (at) => {
       try {
-        const said = await asked(`/at?lon=${at.lng}&lat=${at.lat}&crs=${encodeURIComponent(control.crs)}`), digits = Math.abs(said.y) <= 90 && Math.abs(said.x) <= 180 ? 8 : 3;
+        const said = await asked(`at?lon=${at.lng}&lat=${at.lat}&crs=${encodeURIComponent(control.crs)}`), digits = Math.abs(said.y) <= 90 && Math.abs(said.x) <= 180 ? 8 : 3;
         x.value = said.x.toFixed(digits); y.value = said.y.toFixed(digits);
         about.textContent = `Coordinates in ${control.crs}, as the map shows them: put what was surveyed in their place.`;
         controlLayer.clearLayers();
@@ -83,7 +83,7 @@ const addForm = () => {
   return form;
 };
 const saveControl = async () => {
-  await asked("/control", { method: "PUT", headers: writing({ "Content-Type": "application/json" }), body: JSON.stringify({ crs: control.crs, points: control.points, marks: control.marks }) });
+  await asked("control", { method: "PUT", headers: writing({ "Content-Type": "application/json" }), body: JSON.stringify({ crs: control.crs, points: control.points, marks: control.marks }) });
   control.dirty = false;
 };
 const trying = (work) => async () => { try { await work(); } catch (error) { say(error.message); } };
@@ -128,7 +128,7 @@ const drawControl = () => {
 };
 // -- the run beside ---------------------------------------------------------------------------------------------
 const runPart = () => {
-  const box = element("div"), run = control.run || { state: "none" }, start = button("Make the map with these points", trying(async () => { await saveControl(); control.run = await asked("/control/run", { method: "POST", headers: writing({}) }); drawControl(); watchRun(); }));
+  const box = element("div"), run = control.run || { state: "none" }, start = button("Make the map with these points", trying(async () => { await saveControl(); control.run = await asked("control/run", { method: "POST", headers: writing({}) }); drawControl(); watchRun(); }));
   start.id = "controlrun";
   start.disabled = !control.marks.length || run.state === "running";
   box.append(start);
@@ -150,7 +150,7 @@ const residuals = (points) => {
   table.append(element("caption", "Solution minus survey"), head, body);
   return table;
 };
-const watchRun = () => { setTimeout(async () => { try { control.run = await asked("/control/run"); } catch { /* asked again */ } drawControl(); if (control.run.state === "running") watchRun(); }, 1500); };
+const watchRun = () => { setTimeout(async () => { try { control.run = await asked("control/run"); } catch { /* asked again */ } drawControl(); if (control.run.state === "running") watchRun(); }, 1500); };
 // -- photos of the chosen point -----------------------------------------------------------------------------------
 const lookUp = async (propose) => {
   const point = control.points.find((p) => p.name === control.chosen);
@@ -158,7 +158,7 @@ const lookUp = async (propose) => {
   const marked = marksOf(point.name)[0], photo = marked && [...state.photos.values()].find((p) => p.name === marked.photo);
   const more = photo ? `&marked=${photo.id}&px=${marked.x}&py=${marked.y}${propose ? "&propose=true" : ""}` : "";
   try {
-    const said = await asked(`/control/photos?x=${point.x}&y=${point.y}&crs=${encodeURIComponent(control.crs)}${more}`);
+    const said = await asked(`control/photos?x=${point.x}&y=${point.y}&crs=${encodeURIComponent(control.crs)}${more}`);
     if (control.chosen !== point.name) return;
     control.rows = said.photos;
     if (propose) {
@@ -194,7 +194,7 @@ const middle = (at) => (Number.isInteger(at) ? at + 0.5 : at);
 const loupe = (point, r) => {
   const mark = markIn(point.name, r.name), about = mark || r, k = control.zoom / VIEW;
   const figure = element("figure"), stage = element("div", undefined, "loupe"), img = element("img");
-  img.src = `/photos/${r.id}/detail?x=${about.x.toFixed(2)}&y=${about.y.toFixed(2)}&size=${control.zoom}&shown=${VIEW}`;
+  img.src = `photos/${r.id}/detail?x=${about.x.toFixed(2)}&y=${about.y.toFixed(2)}&size=${control.zoom}&shown=${VIEW}`;
   img.alt = `${r.name} about the ${mark ? "marked" : "predicted"} place`;
   img.loading = "lazy";
   stage.append(img, element("i", undefined, mark ? "mark" : "guess"));

@@ -18,10 +18,10 @@ const drawOverlay = (name, data) => {
   }));
 };
 const showOverlay = async (name) => {
-  const answer = await fetch(`/layers/${encodeURIComponent(name)}`);
+  const answer = await fetch(`layers/${encodeURIComponent(name)}`);
   drawOverlay(name, answer.ok ? await answer.json() : null);
 };
-const readOverlays = async () => { for (const { name } of (await asked("/layers")).layers) await showOverlay(name); };
+const readOverlays = async () => { for (const { name } of (await asked("layers")).layers) await showOverlay(name); };
 const showHere = async (file) => {
   try {
     const data = JSON.parse(await file.text());
@@ -38,7 +38,7 @@ const handIn = async (files) => {
       else if (!(await handControl(file))) say(`${file.name}: here, GeoJSON and lists of control points can be shown`);
       continue;
     }
-    const url = layer ? `/layers?name=${encodeURIComponent(file.name)}` : `/photos?name=${encodeURIComponent(file.name)}&source=browser`;
+    const url = layer ? `layers?name=${encodeURIComponent(file.name)}` : `photos?name=${encodeURIComponent(file.name)}&source=browser`;
     const answer = await fetch(url, { method: "POST", body: file, headers: writing({ "Content-Type": "application/octet-stream" }) }).catch(() => null);
     if (!answer) { say(`${file.name}: the server does not answer`); continue; }
     const said = await answer.json().catch(() => ({}));
@@ -54,15 +54,15 @@ for (const name of ["dragover", "dragleave", "drop"]) document.addEventListener(
 });
 $("finish").onclick = async () => {
   if (!window.confirm("Adjust all photos together and draw the final map at full resolution?")) return;
-  await asked("/finish", { method: "POST", headers: writing({}) }).then(() => say("The final map is being made; this one stays."), (error) => say(error.message));
+  await asked("finish", { method: "POST", headers: writing({}) }).then(() => say("The final map is being made; this one stays."), (error) => say(error.message));
 };
 // -- files of the finished map ----------------------------------------------------------------------------------
 const readFiles = async () => {
-  const { files } = await asked("/files");
+  const { files } = await asked("files");
   $("final").hidden = !files.length;
   const row = (f) => {
     const li = element("li"), a = element("a", f.name === "report.html" ? "Report" : f.what === "export" ? f.name : f.what[0].toUpperCase() + f.what.slice(1));
-    a.href = `/files/${f.name.split("/").map(encodeURIComponent).join("/")}`;
+    a.href = `files/${f.name.split("/").map(encodeURIComponent).join("/")}`;
     if (f.name === "report.html") { a.target = "_blank"; a.rel = "noopener"; } else a.download = "";
     li.append(a, element("small", `${f.name}, ${inSize(f.bytes)}`));
     return li;

@@ -10,7 +10,7 @@ const Growing = L.GridLayer.extend({
     return img;
   },
   fill(img, { x, y, z }, empty) {
-    const url = `/tiles/${z}/${x}/${y}?layer=${encodeURIComponent(this.options.layer)}&v=${state.last}`;
+    const url = `tiles/${z}/${x}/${y}?layer=${encodeURIComponent(this.options.layer)}&v=${state.last}`;
     fetch(url).then((r) => r.status === 200 ? r.blob() : null).then((blob) => {
       if (!blob) { img.removeAttribute("src"); img.style.visibility = "hidden"; if (empty) empty(); return; }
       const address = URL.createObjectURL(blob), next = new Image();
@@ -128,7 +128,7 @@ $("base").onclick = () => {
 };
 $("fit").onclick = fit;
 $("fold").onclick = () => { const folded = document.body.classList.toggle("folded"); $("fold").setAttribute("aria-expanded", String(!folded)); map.invalidateSize(); };
-$("export").onclick = () => { const b = map.getBounds(); $("export").href = `/export?bbox=${[b.getWest(), b.getSouth(), b.getEast(), b.getNorth()].join(",")}&layer=${encodeURIComponent(shownName())}`; };
+$("export").onclick = () => { const b = map.getBounds(); $("export").href = `export?bbox=${[b.getWest(), b.getSouth(), b.getEast(), b.getNorth()].join(",")}&layer=${encodeURIComponent(shownName())}`; };
 
 // -- coordinates and height under the cursor ------------------------------------------------------------------
 const degrees = (at) => `${Math.abs(at.lat).toFixed(6)}° ${at.lat < 0 ? "S" : "N"} ${Math.abs(at.lng).toFixed(6)}° ${at.lng < 0 ? "W" : "E"}`;
@@ -143,7 +143,7 @@ const readPlace = async () => {
   if (hovering || !hover) return;
   const at = hover;
   hover = null; hovering = true;
-  try { const said = await asked(`/at?lon=${at.lng}&lat=${at.lat}`); $("where").textContent = [degrees(at), placeText(said)].filter(Boolean).join(" · "); } catch { /* the degrees stay */ }
+  try { const said = await asked(`at?lon=${at.lng}&lat=${at.lat}`); $("where").textContent = [degrees(at), placeText(said)].filter(Boolean).join(" · "); } catch { /* the degrees stay */ }
   setTimeout(() => { hovering = false; readPlace(); }, 120);
 };
 map.on("mousemove", (e) => { if (!state.fitted) return; $("where").textContent = degrees(e.latlng); hover = e.latlng; readPlace(); });

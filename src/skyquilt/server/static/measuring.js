@@ -30,11 +30,11 @@ const finding = async (mode, points) => {
   if (mode === "area") return { text: Measure.inSquare(Measure.area(points)), area_m2: Measure.area(points) };
   if (mode === "profile") {
     if (points.length < 2) return { text: "" };
-    const said = await asked(`/profile?line=${pairs(points)}`);
+    const said = await asked(`profile?line=${pairs(points)}`);
     return { text: Measure.inMetres(said.distance_m[said.distance_m.length - 1]), length_m: said.distance_m[said.distance_m.length - 1], said };
   }
   if (points.length < 3) return { text: "" };
-  const said = await asked(`/volume?ring=${pairs(points)}`);
+  const said = await asked(`volume?ring=${pairs(points)}`);
   const gap = said.unknown_m2 > 0.01 * said.area_m2 ? `, ${Measure.inSquare(said.unknown_m2)} without heights` : "";
   return { text: `${inCubic(said.above_m3)} above, ${inCubic(said.below_m3)} below the plane through the edge; ${Measure.inSquare(said.area_m2)}${gap}`, ...said };
 };

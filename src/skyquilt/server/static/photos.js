@@ -51,7 +51,7 @@ const listPhotos = () => {
 let listing = null;
 const listSoon = () => { if (!listing) listing = setTimeout(() => { listing = null; listPhotos(); }, 250); };
 const readPhotos = async () => {
-  const said = await asked("/photos");
+  const said = await asked("photos");
   state.photos = new Map(said.photos.map((p) => [p.id, p]));
   state.refused = said.refused;
   listPhotos();
@@ -60,14 +60,14 @@ $("time").oninput = listPhotos;
 
 const ringOf = (p) => p.ring.map(([x, y]) => [y, x]);
 const photosHere = async (at) => {
-  const said = await asked(`/photos?lon=${at.lng}&lat=${at.lat}`);
+  const said = await asked(`photos?lon=${at.lng}&lat=${at.lat}`);
   $("here").hidden = false;
   const mark = (p, li) => {
     for (const other of $("covering").children) { other.classList.remove("chosen"); for (const img of other.querySelectorAll("img")) img.remove(); }
     li.classList.add("chosen");
     const img = element("img", undefined, "thumb");
     img.alt = `photo ${p.name}, reduced`;
-    img.src = `/photos/${p.id}/thumbnail`;
+    img.src = `photos/${p.id}/thumbnail`;
     img.onerror = () => img.remove();
     img.onclick = (e) => { e.stopPropagation(); showBig(p, at); };
     li.append(img);
@@ -77,7 +77,7 @@ const photosHere = async (at) => {
   };
   const rows = said.photos.map((p) => {
     const li = element("li"), open = element("a", "full size", "button");
-    open.href = `/photos/${p.id}/file`; open.target = "_blank"; open.rel = "noopener";
+    open.href = `photos/${p.id}/file`; open.target = "_blank"; open.rel = "noopener";
     open.onclick = (e) => { e.stopPropagation(); if (!e.ctrlKey && !e.metaKey) { e.preventDefault(); showBig(p, at); } };
     li.append(element("span", p.name), open);
     return choosable(li, () => mark(p, li));
@@ -85,7 +85,7 @@ const photosHere = async (at) => {
   $("covering").replaceChildren(...(rows.length ? rows : [element("li", "no photo covers this point")]));
   if (rows.length) mark(said.photos[0], rows[0]);
   $("here").scrollIntoView({ block: "start" });
-  const told = await asked(`/at?lon=${at.lng}&lat=${at.lat}`).catch(() => ({ values: [], crs: null }));
+  const told = await asked(`at?lon=${at.lng}&lat=${at.lat}`).catch(() => ({ values: [], crs: null }));
   const lines = [degrees(at), ...(told.crs ? [`${told.crs} ${told.x.toFixed(2)} ${told.y.toFixed(2)}`] : []), ...told.values.map(valueText)];
   $("values").replaceChildren(...lines.map((text) => element("p", text)));
 };
@@ -93,7 +93,7 @@ const photosHere = async (at) => {
 const showBig = async (p, at) => {
   const box = $("big"), sheet = element("div", undefined, "sheet"), img = element("img");
   img.alt = `photo ${p.name}`;
-  img.src = `/photos/${p.id}/file`;
+  img.src = `photos/${p.id}/file`;
   const close = button("Close", () => box.close()), open = element("a", "in a tab of its own", "button");
   open.href = img.src; open.target = "_blank"; open.rel = "noopener";
   const head = element("header");
@@ -101,7 +101,7 @@ const showBig = async (p, at) => {
   sheet.append(img);
   box.replaceChildren(head, sheet);
   if (!box.open) box.showModal();
-  const place = await asked(`/photos/${p.id}/place?lon=${at.lng}&lat=${at.lat}`).catch(() => null);
+  const place = await asked(`photos/${p.id}/place?lon=${at.lng}&lat=${at.lat}`).catch(() => null);
   if (!place) return;
   const ring = element("i", undefined, "spot");
   ring.style.left = `${100 * (place.x + 0.5) / place.width}%`;

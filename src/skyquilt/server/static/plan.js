@@ -50,7 +50,7 @@
   };
   const minutes = (s) => `${Math.floor(s / 60)}:${String(Math.round(s % 60)).padStart(2, "0")}`;
   const read = async () => {
-    const answer = await fetch("/plan");
+    const answer = await fetch("plan");
     if (!answer.ok) { section.hidden = true; return; }
     const told = await answer.json(), key = JSON.stringify(told.plan && [told.plan.points.length, told.plan.points[0]]);
     if (key !== known) { known = key; draw(told.plan, told.states); } else turn(told.states);
@@ -58,18 +58,18 @@
     drones.replaceChildren(...told.drones.map((d) => make("li", `${d.name}: ${d.taken} of ${d.planned} photos, ${minutes(d.seconds_left)} left`)));
     plans.replaceChildren(...told.plans.map((p) => {
       const li = make("li"), open = make("a", p.name);
-      open.href = `/plans/${encodeURIComponent(p.name)}/plan.html`; open.target = "_blank"; open.rel = "noopener";
+      open.href = `plans/${encodeURIComponent(p.name)}/plan.html`; open.target = "_blank"; open.rel = "noopener";
       li.append(open, " ");
       for (const file of p.files.filter((f) => /^\d\d-/.test(f))) {
         const link = make("a", file.replace(/^.*\./, ""));
-        link.href = `/plans/${encodeURIComponent(p.name)}/${encodeURIComponent(file)}`; link.title = file; link.download = file; link.className = "file";
+        link.href = `plans/${encodeURIComponent(p.name)}/${encodeURIComponent(file)}`; link.title = file; link.download = file; link.className = "file";
         li.append(link, " ");
       }
       return li;
     }));
   };
   const readCover = async () => {
-    const answer = await fetch("/coverage");
+    const answer = await fetch("coverage");
     if (!answer.ok) return;
     const told = await answer.json();
     share.textContent = told.bounds ? `${(100 * told.share).toFixed(1)} % of the area has ${told.views} views` : "";
@@ -77,7 +77,7 @@
     if (cover) { cover.remove(); cover = null; }
     if (told.bounds && showCover.getAttribute("aria-pressed") === "true") {
       const [west, south, east, north] = told.bounds;
-      cover = L.imageOverlay(`/coverage.png?v=${Date.now()}`, [[south, west], [north, east]], { opacity: 0.75, zIndex: 260, interactive: false }).addTo(map);
+      cover = L.imageOverlay(`coverage.png?v=${Date.now()}`, [[south, west], [north, east]], { opacity: 0.75, zIndex: 260, interactive: false }).addTo(map);
     }
   };
   const soon = (work, wait) => { let t = null; return () => { if (!t) t = setTimeout(() => { t = null; work().catch(() => {}); }, wait); }; };
@@ -89,14 +89,14 @@
   let shapes = [], open = null;
   const collection = () => ({ type: "FeatureCollection", features: shapes.map((s) => ({ type: "Feature", properties: s.closed ? { keep_out: true } : {}, geometry: { type: "Polygon", coordinates: [[...s.ring, s.ring[0]].map(([y, x]) => [x, y])] } })) });
   const readAreas = async () => {
-    const answer = await fetch("/areas");
+    const answer = await fetch("areas");
     if (!answer.ok || open) return;
     const polygons = (await answer.json()).features.filter((f) => f.geometry.type === "Polygon");
     shapes = polygons.map((f) => ({ closed: Boolean(f.properties.keep_out), ring: f.geometry.coordinates[0].slice(0, -1).map(([x, y]) => [y, x]) }));
     show();
   };
   const keep = async () => {
-    const answer = await fetch("/areas", { method: "PUT", body: JSON.stringify(collection()), headers: headers({ "Content-Type": "application/json" }) }).catch(() => null);
+    const answer = await fetch("areas", { method: "PUT", body: JSON.stringify(collection()), headers: headers({ "Content-Type": "application/json" }) }).catch(() => null);
     if (answer && answer.ok) return;
     const told = answer ? await answer.json().catch(() => ({})) : {};
     said.textContent = `The areas are not kept: ${typeof told.detail === "string" ? told.detail : "the server does not answer"}`;
@@ -141,13 +141,13 @@
   go.onclick = () => {
     done();
     const value = (id) => encodeURIComponent(document.getElementById(id).value);
-    sent(`/plan?camera=${value("plan-camera")}&height=${value("plan-height")}&drones=${value("plan-drones")}`, JSON.stringify(collection()));
+    sent(`plan?camera=${value("plan-camera")}&height=${value("plan-height")}&drones=${value("plan-drones")}`, JSON.stringify(collection()));
   };
-  fill.onclick = () => sent("/plan/missing", "");
+  fill.onclick = () => sent("plan/missing", "");
   const ready = async (name) => {
-    const answer = await fetch(`/plans/${encodeURIComponent(name)}/points.geojson`);
+    const answer = await fetch(`plans/${encodeURIComponent(name)}/points.geojson`);
     if (!answer.ok) return;
-    const ways = await (await fetch(`/plans/${encodeURIComponent(name)}/routes.geojson`)).json();
+    const ways = await (await fetch(`plans/${encodeURIComponent(name)}/routes.geojson`)).json();
     follow.clearLayers();
     L.geoJSON(ways, { style: { color: "#7c3aed", weight: 2 }, interactive: false }).addTo(follow);
     L.geoJSON(await answer.json(), { pointToLayer: (f, p) => L.circleMarker(p, { radius: 5, color: "#7c3aed", weight: 2, fillOpacity: 0.4, interactive: false }) }).addTo(follow);
@@ -169,7 +169,7 @@
 
   // -- news
   const listen = () => {
-    const news = new EventSource("/events");
+    const news = new EventSource("events");
     news.onopen = () => { readSoon(); coverSoon(); };
     news.onerror = () => { if (news.readyState === 2) setTimeout(listen, 2000); };
     news.addEventListener("plan", (e) => {

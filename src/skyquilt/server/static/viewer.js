@@ -1,7 +1,7 @@
 "use strict";
 // What the survey says of itself, and news while it grows.
 const readInfo = async () => {
-  const info = await asked("/info"), finished = !info.growing;
+  const info = await asked("info"), finished = !info.growing;
   const done = state.info && state.info.finish !== "done" && info.finish === "done";
   state.info = info;
   state.layers = new Map(info.layers.map((l) => [l.name, l]));
@@ -61,7 +61,7 @@ const photoNews = (p) => {
   listSoon(); readInfoSoon();
 };
 const listen = () => {
-  const news = new EventSource(`/events?after=${state.last}`);
+  const news = new EventSource(`events?after=${state.last}`);
   news.onopen = () => { $("link").textContent = state.info && state.info.growing ? "live" : "open"; $("link").className = "live"; catchUp(); };
   news.onerror = () => { $("link").textContent = "lost, trying"; $("link").className = "lost"; if (news.readyState === 2) setTimeout(listen, 1000); };
   news.addEventListener("photo", told("photo", photoNews));
