@@ -71,7 +71,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 52
+    version: ClassVar[int] = 53
 
     def __call__(
         self,
@@ -153,9 +153,11 @@ class Bundle:
             AlignmentError: no two photos are linked.
         """
         features = [f.places for f in features]  # read once, though used many times
-        start = reported_start(photos, priors, features, links) if self._in_space(priors) else None
+        start, ground = None, ground_of(frame)
+        if self._in_space(priors):
+            start = reported_start(photos, priors, features, links, ground)
         if start is None:
-            start = _kept_start(photos, priors, features, links, ground_of(frame), keep)
+            start = _kept_start(photos, priors, features, links, ground, keep)
         if not start.blocks:
             raise AlignmentError(f"none of {len(photos)} photos could be linked to another one")
         some = None

@@ -66,15 +66,18 @@ def find_blurred(
     shown = np.array([details(i) for i in photos], np.float64)
     places, reach = _places(alignment, photos, shown.shape[1:3], z)
     places[~_tied(alignment, places, reach)] = np.nan
-    off = shown - _sharp(shown, places, reach)
+    cameras = np.array([alignment.camera_of[i] for i in photos])
+    off = np.full(shown.shape, np.nan)
+    for name in dict.fromkeys(cameras.tolist()):  # lenses and ground sizes differ
+        own = cameras == name
+        off[own] = shown[own] - _sharp(shown[own], places[own], reach[own])
     told = np.isfinite(off[..., 0]).sum((1, 2)) >= FEWEST_CELLS
     with np.errstate(all="ignore"):
         each = np.full((len(photos), 3), np.nan)
         each[told] = np.nanmedian(off[told].reshape(-1, off[0, ..., 0].size, 3), 1)
     found, notes = dict[int, Blank](), list[str]()
-    cameras = [alignment.camera_of[i] for i in photos]
-    for name in dict.fromkeys(cameras):
-        own = np.flatnonzero([c == name for c in cameras] & told)
+    for name in dict.fromkeys(cameras.tolist()):
+        own = np.flatnonzero((cameras == name) & told)
         if len(own) < FEWEST_PHOTOS:
             continue
         camera = alignment.cameras[name]
