@@ -70,7 +70,7 @@ def seen(alignment, seed=1):
 
 def found(alignment, details):
     names = [f"{k}.jpg" for k in range(len(details))]
-    return find_blurred(alignment, lambda k: details[k].astype(np.float32), names, 0.0)
+    return find_blurred(alignment, lambda k: details[k].astype(np.float32), names)
 
 
 def test_sharp_photos_of_changing_ground_are_all_kept():

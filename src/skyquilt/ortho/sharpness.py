@@ -51,20 +51,16 @@ NAMED = 8
 
 
 def find_blurred(
-    alignment: Alignment,
-    details: Callable[[int], NDArray[np.float32]],
-    names: Sequence[str],
-    z: float,
+    alignment: Alignment, details: Callable[[int], NDArray[np.float32]], names: Sequence[str]
 ) -> tuple[dict[int, Blank], tuple[str, ...]]:
     """What is blurred, by photo, only of photos where something is, and notes. `details`: detail
-    (rows, columns, 2) in the cells of a photo (index); `names` of the photos; `z`: usual height of
-    the ground in m.
+    (rows, columns, 2) in the cells of a photo (index); `names` of the photos.
     """
     photos = sorted(alignment.poses)
     if len(photos) < FEWEST_PHOTOS:
         return {}, ()
     shown = np.array([details(i) for i in photos], np.float64)
-    places, reach = _places(alignment, photos, shown.shape[1:3], z)
+    places, reach = _places(alignment, photos, shown.shape[1:3])
     places[~_tied(alignment, places, reach)] = np.nan
     cameras = np.array([alignment.camera_of[i] for i in photos])
     off = np.full(shown.shape, np.nan)
@@ -103,20 +99,23 @@ def find_blurred(
     return found, tuple(notes)
 
 
+def some_names(names: Sequence[str]) -> str:
+    """Names for a note, not more than a few."""
+    more = len(names) - NAMED
+    return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
 def _note(names: Sequence[str]) -> str:
-    listed = ", ".join(names[:NAMED]) + (
-        f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-    )
     some = f"{len(names)} photos are" if len(names) > 1 else "One photo is"
     return (
-        f"{some} blurred against others of the same ground ({listed}): gusts, a long exposure or a"
-        " drone that flew too fast for it. They are drawn only where no other photo shows the"
-        " ground."
+        f"{some} blurred against others of the same ground ({some_names(names)}): gusts, a long"
+        " exposure or a drone that flew too fast for it. They are drawn only where no other photo"
+        " shows the ground."
     )
 
 
 def _places(
-    alignment: Alignment, photos: Sequence[int], cells: tuple[int, int], z: float
+    alignment: Alignment, photos: Sequence[int], cells: tuple[int, int]
 ) -> tuple[Array, Array]:
     """Places (n, rows, columns, 2) in m that the cells of photos show, NaN where they look flatly,
     and the distance in m (n,) of neighbouring cells.
@@ -124,7 +123,8 @@ def _places(
     rows, columns = cells
     v, u = np.mgrid[:rows, :columns].reshape(2, -1) + 0.5
     out, apart = np.full((len(photos), rows * columns, 2), np.nan), np.zeros(len(photos))
-    ground = level(z)
+    xyz = alignment.ties.xyz
+    ground = level(float(np.median(xyz[:, 2])) if len(xyz) else 0.0)
     for k, i in enumerate(photos):
         pose, camera = alignment.poses[i], alignment.camera(i)
         px = np.column_stack([u / columns * camera.width, v / rows * camera.height]) - 0.5

@@ -12,8 +12,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
-import numpy as np
-
 from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.motion import speeds_of
 from skyquilt.alignment.priors import choose_frame, priors
@@ -35,8 +33,8 @@ from skyquilt.ortho.exposure import Exposure
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.labels import Labels
 from skyquilt.ortho.radiometry import Levelling
-from skyquilt.ortho.sharpness import find_blurred
 from skyquilt.ortho.shown_parts import shown_parts
+from skyquilt.ortho.spoilt import spoilt_parts
 from skyquilt.settings import USUAL_GB, MosaicSettings, PictureSettings
 from skyquilt.workflows.clip_frames import with_frames
 from skyquilt.workflows.finished import Earlier
@@ -250,9 +248,14 @@ def find_ground(
         earlier = aligned.earlier.map_of(aligned.photos, clock.store, output)
     marks = aligned.links.marks
     shown = {name: marked(mask, marks.cell_px[name]) for name, mask in marks.masks.items()}
-    z = float(np.median(aligned.alignment.ties.xyz[:, 2])) if len(aligned.alignment.ties.xyz) else 0
-    names = [p.name for p in aligned.photos]
-    blurred, notes = find_blurred(aligned.alignment, aligned.found.detail, names, z)
+    keys = [p.camera_key for p in aligned.photos]
+    yielding, notes = spoilt_parts(
+        aligned.alignment,
+        aligned.found.detail,
+        aligned.found.thumbnails(sorted(aligned.alignment.poses)),
+        [p.name for p in aligned.photos],
+        {i: shown[key] for i, key in enumerate(keys) if key in shown},
+    )
     steps = ground.find_ground(
         aligned.alignment,
         aligned.grey,
@@ -264,10 +267,7 @@ def find_ground(
         pictures=picture_recipe(),
         earlier=earlier,
         see_through=[i for i, p in enumerate(aligned.photos) if p.alpha],
-        marks={
-            i: shown[p.camera_key] for i, p in enumerate(aligned.photos) if p.camera_key in shown
-        }
-        | blurred,
+        marks=yielding,
     )
     found = yield from clock.stage("surface", steps)
     return replace(found, notes=(*found.notes, *notes))
