@@ -24,8 +24,8 @@ CONTRADICTED_SHARE = 0.03
 LOOSE_DEG, LOOSE_SCALE = 3.0, 0.05
 """Direction and scale that rest on positions alone are told where their deviations are larger."""
 AT_MOST = 0.1
-"""Few positions may fit by chance: they are taken to err by as much as would leave less than is seen
-in this share of cases.
+"""Few positions may fit by chance: they are taken to err by as much as would leave less than is
+seen in this share of cases.
 """
 MIRRORED = 0.3
 """Positions are mirrored where their mirror image misfits by less than this share of their own
