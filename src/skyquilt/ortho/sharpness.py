@@ -19,10 +19,10 @@ from skyquilt.model.poses import Alignment
 from skyquilt.ortho.tie_surface import level
 
 Array = NDArray[np.float64]
-BLURRED = 0.9
+BLURRED = 1.0
 """A photo is blurred where the logarithm of its detail lies this far below what others show of the
 same ground, by more than most photos of its camera do: 4 px of motion take 0.7 to 1.3, 8 px 1.4 to
-2.6; sharp photos of real surveys lie up to 0.56 below, over lakes and woods up to 0.67.
+2.6; sharp photos lie up to 0.8 below.
 """
 SPOILT, SPOILT_SHARE = 1.0, 0.6
 """A cell of the picture is spoilt where it lacks so much in so large a share of the photos of a
@@ -40,10 +40,12 @@ TIED = 3
 """So many tie points must lie within that distance: waves and glitter have none."""
 SHARP_SHARE = 0.75
 """Quantile of what the photos of a place show that counts as sharp: one of four is not blurred."""
-FEWEST_CELLS, FEWEST_PHOTOS, FEWEST_SPOILT = 12, 6, 10
+FEWEST_CELLS, FEWEST_PHOTOS, FEWEST_SPOILT = 20, 6, 10
 """Fewest cells that tell of a photo, and fewest photos that tell of a camera, and of one cell."""
-LEAST_DOWN = 0.5
-"""Cosine of the largest angle from the vertical at which cells are compared."""
+LEAST_DOWN = 0.9
+"""Cosine of the largest angle from the vertical at which cells are compared: slanting views of one
+ground differ, by up to 0.9.
+"""
 FINER = 8
 """Cells of the raster that says where a spot is, for each cell of detail, along a side."""
 NAMED = 8
