@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri
 
 from skyquilt.alignment.enlarged import heights_above_ground
 from skyquilt.alignment.similarity_graph import fit_similarity
@@ -23,9 +22,9 @@ CONTRADICTED_SHARE = 0.03
 """than this share of the flight's extent, where positions contradict the pictures."""
 LOOSE_DEG, LOOSE_SCALE = 3.0, 0.05
 """Direction and scale that rest on positions alone are told where their deviations are larger."""
-AT_MOST = 0.1
+CHANCE = -1.2816
 """Few positions may fit by chance: they are taken to err by as much as would leave less than is
-seen in this share of cases.
+seen in a tenth of cases, the quantile of the normal distribution at this place.
 """
 MIRRORED = 0.3
 """Positions are mirrored where their mirror image misfits by less than this share of their own
@@ -98,7 +97,8 @@ def loose_warnings(priors: Sequence[Prior], alignment: Alignment) -> list[str]:
     if len(told) >= FEWEST_POSITIONS:
         off -= off.mean(0)
         free = 2 * len(told) - 4
-        chance = np.sqrt(free / chdtri(free, 1 - AT_MOST))
+        part = 2 / (9 * free)  # quantile of chi squared over its mean (Wilson and Hilferty 1931)
+        chance = (1 - part + CHANCE * np.sqrt(part)) ** -1.5
         seen = chance * np.sqrt((off**2).sum(0) / (len(told) - 2))
         flat = float(np.sqrt((seen[:2] ** 2).mean()))
         sigma = np.fmin(sigma, np.maximum([flat, flat, seen[2]], 1e-3))
