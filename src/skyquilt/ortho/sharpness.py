@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.geometry.camera import rays
+from skyquilt.geometry.neighbours import nearest
 from skyquilt.imaging.blank import Blank
 from skyquilt.imaging.nodes import View
 from skyquilt.imaging.views import on_ground
@@ -144,14 +145,12 @@ def _places(
 
 def _tied(alignment: Alignment, places: Array, reach: Array) -> NDArray[np.bool_]:
     """(n, rows, columns) whether enough tie points lie near the places of cells."""
-    from scipy.spatial import cKDTree  # most steps before this need it for nothing else
-
     out = np.isfinite(places[..., 0])
     xyz = alignment.ties.xyz
     if len(xyz) < TIED or not out.any():
         return np.zeros(out.shape, np.bool_)
     far = WITHIN * np.broadcast_to(reach[:, None, None], out.shape)[out]
-    out[out] = cKDTree(xyz[:, :2]).query(places[out], k=[TIED])[0][:, 0] <= far
+    out[out] = nearest(xyz[:, :2], places[out], TIED)[0][:, -1] <= far
     return out
 
 
@@ -159,15 +158,13 @@ def _sharp(shown: Array, places: Array, reach: Array) -> Array:
     """Detail (n, rows, columns, 3) that sharp photos show of the ground of each cell, NaN where too
     few photos show it.
     """
-    from scipy.spatial import cKDTree  # most steps before this need it for nothing else
-
     known = np.isfinite(places[..., 0]) & np.isfinite(shown[..., 0])
     out = np.full(shown.shape, np.nan)
     if known.sum() < FEWEST_NEIGHBOURS:
         return out
     at, detail = places[known], shown[known]
     far = WITHIN * np.broadcast_to(reach[:, None, None], known.shape)[known]
-    distance, near = cKDTree(at).query(at, k=min(NEIGHBOURS, len(at)))
+    distance, near = nearest(at, at, min(NEIGHBOURS, len(at)))
     same = distance <= far[:, None]
     count = same.sum(1)
     ordered = np.sort(np.where(same[..., None], detail[near], np.inf), axis=1)
