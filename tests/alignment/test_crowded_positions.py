@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skyquilt.alignment.aligners import Auto, ByLinks, by_pose
-from skyquilt.alignment.crowded_positions import believed, without_crowded
+from skyquilt.alignment.crowded_positions import ONE_PLACE, believed, without_crowded
 from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.model.photo import ControlPoint
 from tests.alignment.test_oblique_start import FRAME, Slanting
@@ -95,3 +95,32 @@ def test_control_points_keep_the_frame():
     found, _ = without_crowded(inputs(survey, at_one_place(survey, 1.0), control=points))
     assert found.frame.crs == FRAME.crs
     assert all(np.isnan(p.map_C[:2]).all() for p in found.priors)
+
+
+def panorama(tilt, drift_m):
+    """Photos all around from one place, where a drone drifts."""
+    off = np.random.default_rng(5).normal(0, drift_m, (20, 3)) + (0.0, 0.0, 50.0)
+    return [(*off[k].tolist(), 360.0 * k / 20 - 180, tilt) for k in range(20)]
+
+
+@pytest.mark.parametrize(("tilt", "drift_m"), [(45.0, 0.0), (45.0, 0.1), (52.0, 0.4)])
+def test_a_panorama_keeps_its_positions_and_is_placed_by_its_angles(tilt, drift_m):
+    """Its photos show places far apart and were taken from one: what only turns has no parallax."""
+    survey = Slanting(panorama(tilt, drift_m))
+    given = inputs(survey, survey.priors)
+    assert without_crowded(given) == (given, ())
+    found = Auto(bundle=ByLinks(), pose=by_pose(None, repair=True))(given)
+    assert len(found.poses) == len(survey.photos)
+    apart, turned = survey.errors(found)
+    assert apart.max() < 1.0  # positions err by 1.5, and do not tear it
+    assert turned.max() < 3.0  # as angles err
+    assert found.notes.count(ONE_PLACE) == 1
+    assert (found.method == "bundle") == (drift_m > 0.2)
+
+
+def test_oblique_photos_whose_positions_are_those_of_the_remote_control():
+    survey = Slanting(
+        [(x, y, 45.0, 0.0, 50.0) for y in (-60, -42, -24) for x in range(-54, 60, 18)]
+    )
+    _, (note,) = without_crowded(inputs(survey, at_one_place(survey, 1.5)))
+    assert "remote control" in note

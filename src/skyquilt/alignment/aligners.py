@@ -12,7 +12,7 @@ from skyquilt.alignment.addition import added, median_offset
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.control import control_in_frame
 from skyquilt.alignment.copied_views import without_copied_views
-from skyquilt.alignment.crowded_positions import without_crowded
+from skyquilt.alignment.crowded_positions import at_their_middle, one_place_notes, without_crowded
 from skyquilt.alignment.determined import ground_places
 from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.oblique import tilted, without_photos
@@ -45,6 +45,8 @@ levels of 255 below and above which it is.
 """
 ONE_TONE = "it is black or white all over"
 """The reason recorded for such a photo."""
+UNTIED = "no point that photos share has a place of its own, so each is placed by its metadata"
+"""Why a panorama is not adjusted."""
 REQUESTED = "asked for"
 """The reason recorded for a method that the user requested."""
 
@@ -57,7 +59,7 @@ class ByLinks:
 
     bundle: Bundle = field(default_factory=Bundle)
     """The adjustment."""
-    version: ClassVar[int] = 5
+    version: ClassVar[int] = 6
     needs_links: ClassVar[bool] = True
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -88,7 +90,7 @@ class ByLinks:
             if p.position is None and p.attitude is None and p.focal.source == "guess"
         }
         found = without_copied_views(found, [p.name for p in inputs.photos], told, bare)
-        found = replace(found, notes=(*found.notes, *said))
+        found = replace(found, notes=(*found.notes, *said, *one_place_notes(inputs)))
         return replace(without_strange_blocks(with_loose_photos(found, inputs)), why=REQUESTED)
 
 
@@ -127,7 +129,7 @@ class Auto:
     """For linked photos."""
     pose: ByReport
     """For photos that only have positions."""
-    version: ClassVar[int] = 5
+    version: ClassVar[int] = 6
     needs_links: ClassVar[bool] = True
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -143,6 +145,10 @@ class Auto:
         try:
             method, why = choose_method(len(inputs.photos), len(inputs.links), positions, control)
             found = (self.bundle if method == "bundle" else self.pose)(inputs)
+            if not found.poses and positions:
+                notes, why = found.notes, UNTIED
+                found = replace(self.pose, repair=False)(at_their_middle(inputs))
+                found = replace(found, notes=(*notes, *found.notes))
         except AlignmentError as error:
             if blank:
                 raise AlignmentError(f"{error}. {blank[0]}") from error

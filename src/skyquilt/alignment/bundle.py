@@ -155,9 +155,11 @@ class Bundle:
             AlignmentError: no two photos are linked.
         """
         features = [f.places for f in features]  # read once, though used many times
-        start = reported_start(photos, priors, features, links) if self._in_space(priors) else None
+        start, ground = None, ground_of(frame)
+        if self._in_space(priors):
+            start = reported_start(photos, priors, features, links, ground)
         if start is None:
-            start = _kept_start(photos, priors, features, links, ground_of(frame), keep)
+            start = _kept_start(photos, priors, features, links, ground, keep)
         if not start.blocks:
             raise AlignmentError(f"none of {len(photos)} photos could be linked to another one")
         some = None

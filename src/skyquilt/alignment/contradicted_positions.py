@@ -22,6 +22,10 @@ CONTRADICTED_SHARE = 0.03
 """than this share of the flight's extent, where positions contradict the pictures."""
 LOOSE_DEG, LOOSE_SCALE = 3.0, 0.05
 """Direction and scale that rest on positions alone are told where their deviations are larger."""
+CHANCE = -1.2816
+"""Few positions may fit by chance: they are taken to err by as much as would leave less than is
+seen in a tenth of cases, the quantile of the normal distribution at this place.
+"""
 MIRRORED = 0.3
 """Positions are mirrored where their mirror image misfits by less than this share of their own
 misfit.
@@ -80,7 +84,7 @@ def loose_warnings(priors: Sequence[Prior], alignment: Alignment) -> list[str]:
     tell the direction of the map, and no photo tells a heading; or hardly its scale, and no height
     above ground is known: a hover, a climb, a few photos.
 
-    Positions err as they state, or as they are seen to, whichever is less.
+    Positions err as they state, or as they are seen to at most, whichever is less.
     """
     held = [i for i in max(alignment.blocks, key=len, default=()) if i in alignment.poses]
     told = [i for i in held if np.isfinite(priors[i].map_C[:2]).all()]
@@ -92,7 +96,10 @@ def loose_warnings(priors: Sequence[Prior], alignment: Alignment) -> list[str]:
     sigma = np.array([priors[i].sigma_C for i in told])
     if len(told) >= FEWEST_POSITIONS:
         off -= off.mean(0)
-        seen = np.sqrt((off**2).sum(0) / (len(told) - 2))
+        free = 2 * len(told) - 4
+        part = 2 / (9 * free)  # quantile of chi squared over its mean (Wilson and Hilferty 1931)
+        chance = (1 - part + CHANCE * np.sqrt(part)) ** -1.5
+        seen = chance * np.sqrt((off**2).sum(0) / (len(told) - 2))
         flat = float(np.sqrt((seen[:2] ** 2).mean()))
         sigma = np.fmin(sigma, np.maximum([flat, flat, seen[2]], 1e-3))
     reach = C - np.average(C, axis=0, weights=sigma[:, 0] ** -2)

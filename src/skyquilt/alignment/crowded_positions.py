@@ -10,8 +10,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.determined import STATED_DEG
 from skyquilt.alignment.inputs import AlignmentInputs
+from skyquilt.alignment.oblique_start import map_rays
 from skyquilt.alignment.start import NOMINAL_HEIGHT_M, find_start, ground_of
+from skyquilt.model.features import Link
 from skyquilt.model.poses import Alignment, MapFrame, Prior
 
 FEWEST = 4
@@ -26,6 +29,19 @@ LEAST_HEIGHT_M = 8.0
 """... or from this height, where they report none: with positions that crowd, the map would show
 photos taken from below 2 m.
 """
+FROM_ONE_PLACE_DEG = 5.0
+"""Matched rays that differ by no more, in the median, by the angles that photos report, were taken
+from one place: the photos of a panorama. From places as far apart as `FURTHER` asks for they differ
+by 15 degrees and more.
+"""
+ASKED = 200
+"""Pairs of photos that are asked for that."""
+ONE_PLACE = (
+    "The photos were taken from one place, as a panorama or a hover: nothing tells the heights of"
+    " the ground, which is drawn as if it were level. Houses and trees lean outwards, hills shift"
+    " what is far from the middle, and the scale rests on the height above take-off."
+)
+"""What is said of such photos."""
 FEWEST_CONTROL = 3
 """Control points that place a map without positions."""
 
@@ -37,6 +53,8 @@ def without_crowded(inputs: AlignmentInputs) -> tuple[AlignmentInputs, tuple[str
     told = inputs.priors
     reach = _reach(np.array([p.map_C[:2] for p in told]).reshape(-1, 2))
     if not inputs.links or inputs.frame.crs is None or not _within_noise(told, reach):
+        return inputs, ()
+    if _only_turned(inputs):
         return inputs, ()
     bare, ground = without_places(told), ground_of(inputs.frame)
     start = find_start(inputs.photos, bare, inputs.features, inputs.links, ground)
@@ -79,6 +97,46 @@ def believed(found: Alignment, frame: MapFrame, priors: Sequence[Prior]) -> Sequ
 def _within_noise(priors: Sequence[Prior], reach: float) -> bool:
     sigma = [p.sigma_C[0] for p in priors if np.isfinite(p.map_C[0])]
     return len(sigma) >= FEWEST and reach < NOISE * float(np.median(sigma))
+
+
+def one_place_notes(inputs: AlignmentInputs) -> tuple[str, ...]:
+    """A sentence on the photos of a panorama or a hover."""
+    reach = _reach(np.array([p.map_C[:2] for p in inputs.priors]).reshape(-1, 2))
+    if inputs.frame.crs is None or not _within_noise(inputs.priors, reach):
+        return ()
+    return (ONE_PLACE,) if _only_turned(inputs) else ()
+
+
+def at_their_middle(inputs: AlignmentInputs) -> AlignmentInputs:
+    """The inputs with all photos in the middle of their positions, where the camera only turned:
+    errors of receivers would tear the picture.
+    """
+    if not _only_turned(inputs):
+        return inputs
+    middle = np.nanmedian([p.map_C for p in inputs.priors], axis=0)
+    return replace(inputs, priors=[replace(p, map_C=middle.copy()) for p in inputs.priors])
+
+
+def _only_turned(inputs: AlignmentInputs) -> bool:
+    """Whether the camera only turned, by the angles that photos report: what they show apart in the
+    plane of the ground are their slanting views.
+    """
+    known = [np.isfinite(p.yaw_deg) and p.sigma_tilt_deg <= STATED_DEG for p in inputs.priors]
+    told = [k for k in inputs.links if known[k.a] and known[k.b]]
+    if not told or 2 * len(told) < len(inputs.links):
+        return False
+    some = np.unique(np.linspace(0, len(told) - 1, ASKED).astype(int)).tolist()
+    return float(np.median([_rays_apart_deg(inputs, told[k]) for k in some])) <= FROM_ONE_PLACE_DEG
+
+
+def _rays_apart_deg(inputs: AlignmentInputs, link: Link) -> float:
+    """Median angle in degrees between the rays of two photos to what both show."""
+    rays = [
+        map_rays(inputs.photos[i], inputs.priors[i], inputs.features[i].px[index])
+        for i, index in ((link.a, link.index_a), (link.b, link.index_b))
+    ]
+    sine = np.linalg.norm(np.cross(rays[0], rays[1]), axis=1)
+    return float(np.degrees(np.arcsin(np.median(np.minimum(sine, 1)))))
 
 
 def _reach(xy: NDArray[np.float64]) -> float:

@@ -109,19 +109,24 @@ def reported_start(
     priors: Sequence[Prior],
     features: Sequence[Features],
     links: Sequence[Link],
+    ground_m: float = np.nan,
 ) -> Start | None:
     """The start with linked photos where their metadata put them, photos that do not tell their
-    pose left out; None if the rays of these do not tell the height of the ground.
+    pose left out. Where the rays of these do not tell the height of the ground, since all were
+    taken from one place, it is taken for `ground_m`; None if that is not known either.
     """
     links = tuple(k for k in links if told(priors[k.a]) and told(priors[k.b]))
     plane = [plane_link(k, photos, features) for k in links]
     groups = [g.tolist() for g in components(len(photos), plane) if len(g) > 1]
     members = sorted(i for g in groups for i in g)
     meetings = _meetings(photos, priors, features, links)
-    if not members or len(meetings) < FEWEST_MET:
+    if not members:
+        return None
+    seen = float(np.median(meetings)) if len(meetings) >= FEWEST_MET else ground_m
+    if np.isnan(seen):
         return None
     lowest = min(priors[i].map_C[2] for i in members)
-    ground = min(float(np.median(meetings)), lowest - 1.0)
+    ground = min(seen, lowest - 1.0)
     placed = {}
     for i in members:
         x, y, z = priors[i].map_C.tolist()
@@ -148,7 +153,7 @@ def _meetings(
     found = [np.zeros(0)]
     for k in links:
         rays = [
-            _rays(photos[i], priors[i], features[i].px[index])
+            map_rays(photos[i], priors[i], features[i].px[index])
             for i, index in ((k.a, k.index_a), (k.b, k.index_b))
         ]
         count = len(k)
@@ -163,8 +168,10 @@ def _meetings(
     return np.concatenate(found)
 
 
-def _rays(photo: Photo, prior: Prior, px: NDArray[np.floating]) -> Array:
-    """(n, 3) unit vectors in the map frame, the lens's distortion neglected."""
+def map_rays(photo: Photo, prior: Prior, px: NDArray[np.floating]) -> Array:
+    """(n, 3) unit vectors in the map frame to keypoints (n, 2) of a photo that looks as it reports,
+    the lens's distortion neglected.
+    """
     middle = np.array([photo.width - 1, photo.height - 1]) / 2
     local = np.column_stack(
         [(as_pinhole(photo.lens, px) - middle) / photo.lens.focal, np.ones(len(px))]

@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from skyquilt.simulate.weather import Weather
 
 PresetName = Literal["default", "demo", "strip", "roundtrip", "thermal", "drones"]
+TerrainName = Literal[
+    "landscape", "bare", "slope", "cliff", "quarry", "bridge", "town", "shore", "chessboard"
+]
+"""Equal to `simulate.terrain.Terrain`, which is not imported before it is needed."""
 
 
 def command(
@@ -85,9 +89,7 @@ def command(
     relief: Annotated[
         float | None, typer.Option(help="height between low and high ground, m")
     ] = None,
-    terrain: Annotated[
-        Literal["landscape", "chessboard"] | None, typer.Option(help="kind of terrain")
-    ] = None,
+    terrain: Annotated[TerrainName | None, typer.Option(help="kind of terrain")] = None,
     season: Annotated[
         Literal["summer", "winter"] | None, typer.Option(help="of the photos")
     ] = None,

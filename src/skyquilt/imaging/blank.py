@@ -96,6 +96,21 @@ def marked(mask: Mask, cell_px: float) -> Blank:
     return Blank(room=_room(around > 0), size=size)
 
 
+def around(mask: Mask, size: tuple[int, int]) -> Blank:
+    """The parts of a photo under a mask (h, w) of its reduced picture; `size`: width and height of
+    the photo in px.
+    """
+    return Blank(room=_room(mask), size=size)
+
+
+def joined(a: Blank, b: Blank) -> Blank:
+    """Parts of a photo that are in either."""
+    if a.room.size < b.room.size:
+        a, b = b, a
+    other = cv2.resize(b.room, a.room.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    return Blank(room=np.minimum(a.room, np.asarray(other, np.float32)), size=a.size)
+
+
 def blank_rim(pictures: Sequence[NDArray[np.uint8]]) -> Mask | None:
     """Where none of some pictures (h, w) of one camera shows anything; None where all do."""
     lightest = np.max(pictures, axis=0)

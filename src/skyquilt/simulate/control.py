@@ -63,7 +63,12 @@ def lay_out(
         -reach, reach, (_CANDIDATES, 2)
     )
     covered = _covered(country.layout)
-    clear = np.array([_open(country.layout, covered, place) for place in anywhere])
+    clear = np.array(
+        [
+            _open(country.layout, covered, place) and country.ground.stands(*map(float, place))
+            for place in anywhere
+        ]
+    )
     views = _views(lens, shots, anywhere)
     places = anywhere[:wanted]
     for least in (1, 2, 3, 4):  # the largest number of views that enough places have

@@ -20,6 +20,7 @@ from skyquilt.simulate.settings import Pictures
 from skyquilt.simulate.weather import Weather
 
 _TEXTURE_PX = 1024
+_WET_M = 0.02
 
 
 @cache
@@ -116,6 +117,9 @@ class Exposer:
         )
         seen = sample(np.ascontiguousarray(colours), hits).astype(np.float32)
         seen *= self.flanks(hits, heights, window)[..., None]
+        if self.scene.water is not None:
+            place = hits * np.float32(window.res) + np.array([window.xs[0], -window.ys[0]])
+            seen = with_waves(seen, place, heights <= self.scene.water + _WET_M, rng)
         seen = with_horizon(seen, self.scene, self.directions, shot)
         seen = _blurred(seen, settings)
         seen *= (np.float32(gain) * falloff(self.lens, settings.vignetting))[..., None]
@@ -136,6 +140,24 @@ class Exposer:
         kelvin = cv2.GaussianBlur(kelvin, (0, 0), 0.7) + np.float32(100 * offset)
         kelvin += rng.standard_normal(kelvin.shape, dtype=np.float32) * np.float32(100 * noise)
         return np.asarray(np.clip(kelvin + 0.5, 0, 65535).astype(np.uint16))
+
+
+def with_waves(
+    seen: Floats, place: Doubles, wet: NDArray[np.bool_], rng: np.random.Generator
+) -> Floats:
+    """A picture (h, w, 3) with the waves of this moment, and with the sun's glitter on them, where
+    its pixels, at places (h, w, 2) in m, show water (h, w).
+    """
+    x, y = place[wet].T
+    height = np.zeros(len(x))
+    for length in (0.5, 0.9, 1.6, 2.7, 4.5, 7.0):
+        course, phase = rng.normal(0.6, 0.35), rng.uniform(0, 2 * np.pi)
+        along = x * np.cos(course) + y * np.sin(course)
+        height += np.cos(2 * np.pi * along / length + phase) / 3
+    out = seen.copy()
+    glitter = 160 * np.clip(height - 0.9, 0, 1)
+    out[wet] = out[wet] * (1 + 0.2 * height)[:, None] + glitter[:, None]
+    return out
 
 
 def exposer(scene: Scene, lens: Lens) -> Exposer:

@@ -11,6 +11,7 @@ from skyquilt.simulate import materials as m
 from skyquilt.simulate.canvas import WARM_K, Canvas
 from skyquilt.simulate.grid import Doubles, Floats
 from skyquilt.simulate.layout import Layout, Parcel, Road
+from skyquilt.simulate.terrain import WATER_M, Terrain, deck
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,3 +187,15 @@ def paint_ponds(canvas: Canvas, layout: Layout) -> None:
         water = canvas.polygon(shore)
         canvas.lay(m.WATER, water, 0.05 * canvas.broad + 0.012 * canvas.patchy)
         canvas.height[...] += water * (canvas.ground - canvas.height)
+
+
+def paint_shape(canvas: Canvas, kind: Terrain) -> None:
+    """Paints the lake of a shore, or the deck of a bridge."""
+    if kind == "shore":
+        water = canvas.ground <= WATER_M
+        canvas.lay(m.WATER, water, 0.05 * canvas.broad + 0.012 * canvas.patchy)
+        canvas.height[water] = WATER_M
+    elif kind == "bridge":
+        road = deck(canvas.grid)
+        canvas.lay(m.ASPHALT, road, 0.018 * canvas.grain + 0.02 * canvas.fine)
+        canvas.height[road] = canvas.ground[road]

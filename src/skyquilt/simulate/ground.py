@@ -1,4 +1,4 @@
-"""The bare ground: hills with level ponds."""
+"""The bare ground: hills, other shapes of land, and level ponds."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,6 +10,7 @@ from scipy import sparse
 
 from skyquilt.simulate.grid import Doubles, Floats, Grid
 from skyquilt.simulate.noise import Noise
+from skyquilt.simulate.terrain import Terrain, shaped, stands
 
 _POND_RES = 0.25
 _BANK_M = 9.0
@@ -57,15 +58,20 @@ class Ground:
     """Height between low and high places of a site, m."""
     shores: tuple[Doubles, ...] = ()
     """Outlines of the ponds."""
+    kind: Terrain = "landscape"
+    """Shape of the land besides its hills."""
 
     def hills(self, grid: Grid) -> Floats:
         """Heights without ponds; (height, width), m."""
+        return shaped(self.kind, self._smooth(grid), grid)
+
+    def _smooth(self, grid: Grid) -> Floats:
         coarse = max(
             1, int(1.0 / grid.res)
         )  # no wavelength below 10 m: compute it per metre and enlarge
         if coarse < 3 or min(grid.width, grid.height) < 8:
             return self.noise.fractal(grid, 170.0, 10.0, 0.42, 1) * np.float32(self.relief / 3.6)
-        return _enlarged(self.hills, grid, coarse)
+        return _enlarged(self._smooth, grid, coarse)
 
     def heights(self, grid: Grid) -> Floats:
         """Heights (height, width), m above the base."""
@@ -79,6 +85,11 @@ class Ground:
     def at(self, x: float, y: float) -> float:
         """Height of one point, m above the base."""
         return float(self.heights(_point(x, y))[0, 0])
+
+    def stands(self, x: float, y: float) -> bool:
+        """Whether a house, a tree or a target stands firmly there: not in a lake or on a cliff."""
+        around = Grid(left=x - 2.5, top=y + 2.5, res=1.0, width=5, height=5)
+        return stands(self.kind, self.hills(around), around)
 
     @cached_property
     def basins(self) -> tuple[Basin, ...]:

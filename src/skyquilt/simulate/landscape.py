@@ -1,5 +1,7 @@
 """Generates the landscape: divides it into parcels, and adds roads, buildings and trees."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from skyquilt.simulate.grid import Doubles
@@ -17,6 +19,7 @@ from skyquilt.simulate.layout import (
     divide,
     rectangle,
 )
+from skyquilt.simulate.terrain import Terrain
 
 _ESTATE_M = 400.0
 """Large areas are first divided into estates of this size, so that each estate has all land
@@ -24,15 +27,24 @@ uses.
 """
 
 
-def landscape(bounds: tuple[float, float, float, float], seed: int) -> Layout:
+_USES = {"bare": ("bare", "stubble"), "town": ("yard", "yard", "yard", "meadow", "yard", "orchard")}
+"""Land uses of kinds of terrain that have others than `KINDS`."""
+
+
+def landscape(
+    bounds: tuple[float, float, float, float], seed: int, terrain: Terrain = "landscape"
+) -> Layout:
     """The layout over map bounds (x0, y0, x1, y1) in m."""
     rng = np.random.default_rng([seed, 11])
     frame = Frame(angle=float(np.radians(rng.uniform(8, 28))))
     cuts: list[tuple[Doubles, float]] = []
     lots = [lot for estate in _estates(bounds) for lot in _shuffled(divide(estate, rng, cuts), rng)]
-    kinds = [KINDS[i % len(KINDS)] for i in range(len(lots))]
+    uses = _USES.get(terrain, KINDS)
+    kinds = [uses[i % len(uses)] for i in range(len(lots))]
     parcels = tuple(_parcel(lot, kind, frame, rng) for lot, kind in zip(lots, kinds, strict=True))
     houses, trees, cars = _furnish(lots, kinds, frame, rng)
+    if terrain == "town":
+        houses = [_block(house, rng) for house in houses]
     roads = _roads(cuts, frame)
     trees += _avenue(roads, rng)
     ponds = tuple(
@@ -156,6 +168,19 @@ def _house(x: float, y: float, angle: float, rng: np.random.Generator) -> House:
         eave=float(rng.uniform(3, 5.5)),
         rise=0.0 if flat else float(rng.uniform(1.6, 2.8)),
         roof=4 if flat else int(rng.integers(4)),
+    )
+
+
+def _block(house: House, rng: np.random.Generator) -> House:
+    """A block of flats or offices in place of a house; most have flat roofs."""
+    flat = rng.random() < 0.6
+    return replace(
+        house,
+        eave=float(rng.uniform(10, 32)),
+        length=1.3 * house.length,
+        depth=1.2 * house.depth,
+        rise=0.0 if flat else max(house.rise, 1.6),
+        roof=4 if flat else house.roof,
     )
 
 

@@ -1,6 +1,7 @@
 """The plan of the terrain as vectors: parcels, roads, and objects."""
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -126,6 +127,18 @@ class Layout:
     """Cars."""
     ponds: tuple[Doubles, ...] = field(default=())
     """Outlines of the ponds, (n, 2) map polygons."""
+
+    def on(self, stands: Callable[[float, float], bool]) -> "Layout":
+        """With those houses, trees and cars only for whose place (x, y) `stands` is true, and the
+        ponds all of whose shore it is true for.
+        """
+        return replace(
+            self,
+            houses=tuple(h for h in self.houses if stands(h.x, h.y)),
+            trees=tuple(t for t in self.trees if stands(t.x, t.y)),
+            cars=tuple(c for c in self.cars if stands(c.x, c.y)),
+            ponds=tuple(p for p in self.ponds if all(stands(float(x), float(y)) for x, y in p)),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,6 +18,7 @@ from skyquilt.simulate.noise import Noise
 from skyquilt.simulate.reported import Place, Report, Start, place_at, report_all
 from skyquilt.simulate.scene import Country, Scene, empty_scene
 from skyquilt.simulate.settings import FlightSettings, Pictures, Thermal, Video
+from skyquilt.simulate.terrain import WATER_M, depth
 from skyquilt.simulate.truth import (
     Taken,
     TakenClip,
@@ -97,7 +98,8 @@ def prepare(
     settings = settings.checked()
     points = plan(settings.route, settings.lens) if waypoints is None else waypoints
     place = place_at(settings.scene.latitude, settings.scene.longitude)
-    hills = Ground(noise=Noise(seed=settings.seed), relief=settings.scene.relief)
+    scene = settings.scene
+    hills = Ground(noise=Noise(seed=settings.seed), relief=scene.relief, kind=scene.kind)
     home = takeoff or (points[0].x, points[0].y)
     start = Start(base=settings.scene.base, takeoff=hills.at(*home))
     shots = fly(points, settings.route, start.takeoff, settings.seed, "SIM")
@@ -178,7 +180,7 @@ def _bounds(
     settings: FlightSettings, flights: list[Flight | None]
 ) -> tuple[float, float, float, float]:
     """The area that all photos can see of the lowest ground, with a margin."""
-    lowest = -0.9 * settings.scene.relief - 1.0
+    lowest = -0.9 * settings.scene.relief - 1.0 - depth(settings.scene.kind)
     parts = [footprint(f.lens, shot, lowest) for f in flights if f is not None for shot in f.shots]
     ground = np.concatenate(parts)
     (x0, y0), (x1, y1) = ground.min(axis=0) - 3.0, ground.max(axis=0) + 3.0
@@ -271,6 +273,7 @@ def _drawn(
         thermal=heat,
         scratch=output / ".scratch" / stage,
         hours=not heat and world.settings.pictures.sun_hours > 0,
+        water=WATER_M if world.settings.scene.kind == "shore" else None,
     )
     for done, total in world.country.draw(scene, weather, scratch=output / ".scratch" / stage):
         yield Progress(stage=stage, done=done, total=total)

@@ -4,14 +4,20 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.simulate.canvas import Canvas
-from skyquilt.simulate.fields import paint_borders, paint_parcels, paint_ponds, paint_roads
+from skyquilt.simulate.fields import (
+    paint_borders,
+    paint_parcels,
+    paint_ponds,
+    paint_roads,
+    paint_shape,
+)
 from skyquilt.simulate.grid import Floats, Grid
 from skyquilt.simulate.ground import Ground
 from skyquilt.simulate.landscape import landscape
@@ -19,6 +25,7 @@ from skyquilt.simulate.layout import Layout
 from skyquilt.simulate.light import lit, shadow_reach, shine
 from skyquilt.simulate.noise import Noise
 from skyquilt.simulate.targets import Target, paint_targets
+from skyquilt.simulate.terrain import Terrain
 from skyquilt.simulate.things import paint_things
 from skyquilt.simulate.weather import Weather
 
@@ -30,8 +37,8 @@ _IN_MEMORY = 60_000_000  # cells; larger scenes are kept in files
 class SceneSettings:
     """Settings of the terrain."""
 
-    kind: Literal["landscape", "chessboard"] = "landscape"
-    """A farmed landscape, or a level chess-board for distortion tests."""
+    kind: Terrain = "landscape"
+    """What the land is like; `simulate.terrain` describes the kinds."""
     relief: float = 6.0
     """Height between low and high places of a site, m."""
     base: float = 440.0
@@ -58,6 +65,8 @@ class Scene:
     """(h, w) apparent temperature in hundredths of a kelvin."""
     look: NDArray[np.float16] | None = None
     """(h, w, 4) colours and temperatures without sunlight, where other hours will be wanted."""
+    water: float | None = None
+    """Level of water whose waves move, m above the base; None: there is none."""
 
     def at_hour(self, part: Grid, weather: Weather) -> NDArray[np.uint8]:
         """Colours (h, w, 3) of a part under the sunlight of another moment.
@@ -86,7 +95,9 @@ class Country:
     @cached_property
     def layout(self) -> Layout:
         """Parcels, roads and objects."""
-        return Layout() if self.settings.kind == "chessboard" else landscape(self.bounds, self.seed)
+        if self.settings.kind == "chessboard":
+            return Layout()
+        return landscape(self.bounds, self.seed, self.settings.kind).on(self._land.stands)
 
     @cached_property
     def noise(self) -> Noise:
@@ -96,7 +107,12 @@ class Country:
     @cached_property
     def ground(self) -> Ground:
         """The bare ground."""
-        return Ground(noise=self.noise, relief=self.settings.relief, shores=self.layout.ponds)
+        return replace(self._land, shores=self.layout.ponds)
+
+    @cached_property
+    def _land(self) -> Ground:
+        """The ground without ponds."""
+        return Ground(noise=self.noise, relief=self.settings.relief, kind=self.settings.kind)
 
     def grid(self, res: float) -> Grid:
         """The raster over the bounds; its corner is at a multiple of the cell size."""
@@ -127,6 +143,7 @@ class Country:
             paint_borders(canvas, self.layout)
             paint_roads(canvas, self.layout)
             paint_ponds(canvas, self.layout)
+            paint_shape(canvas, self.settings.kind)
             paint_things(canvas, self.layout, self.ground)
         paint_targets(canvas, self.targets)
         return canvas
@@ -166,14 +183,19 @@ class Country:
             _light(scene, scene.look, block, weather, flat=self.settings.kind == "chessboard")
 
 
-def empty_scene(grid: Grid, *, thermal: bool, scratch: Path, hours: bool = False) -> Scene:
-    """Allocates a scene, in memory or in files below `scratch`; `hours`: for several moments."""
+def empty_scene(
+    grid: Grid, *, thermal: bool, scratch: Path, hours: bool = False, water: float | None = None
+) -> Scene:
+    """Allocates a scene, in memory or in files below `scratch`; `hours`: for several moments,
+    `water`: level of water with waves, m above the base.
+    """
     return Scene(
         grid=grid,
         height=_room(grid, (), np.float32, scratch / "height"),
         rgb=_room(grid, (3,), np.uint8, scratch / "rgb"),
         thermal=_room(grid, (), np.uint16, scratch / "thermal") if thermal else None,
         look=_room(grid, (4,), np.float16, scratch / "look") if hours else None,
+        water=water,
     )
 
 

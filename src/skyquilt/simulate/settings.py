@@ -10,6 +10,7 @@ import numpy as np
 from skyquilt.errors import UsageError
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.scene import SceneSettings
+from skyquilt.simulate.terrain import height
 from skyquilt.simulate.weather import Weather
 
 YawLie = Literal["none", "turned", "tag"]
@@ -280,7 +281,7 @@ _Rules = list[tuple[bool, str]]
 
 
 def _route_rules(settings: FlightSettings) -> _Rules:
-    route, relief = settings.route, settings.scene.relief
+    route, relief, kind = settings.route, settings.scene.relief, settings.scene.kind
     low = f"height {route.height:g} m is too low over a relief of {relief:g} m"
     lost = f"cannot lose {route.lost} of {route.photos} photos, at most every second one"
     return [
@@ -297,6 +298,10 @@ def _route_rules(settings: FlightSettings) -> _Rules:
             f"the heading must be -360 to 360 degrees, not {route.heading:g}",
         ),
         (route.height > 2 * relief, low),
+        (
+            route.height >= 25 + height(kind),
+            f"height must be at least {25 + height(kind):g} m over {kind}, not {route.height:g} m",
+        ),
         (0 < route.speed <= 60, f"speed must be above 0 and at most 60 m/s, not {route.speed:g}"),
         (
             0 <= settings.lens.readout <= 1,

@@ -33,6 +33,7 @@ from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.labels import Labels
 from skyquilt.ortho.radiometry import Levelling
 from skyquilt.ortho.shown_parts import shown_parts
+from skyquilt.ortho.spoilt import spoilt_parts
 from skyquilt.settings import USUAL_GB, MosaicSettings, PictureSettings
 from skyquilt.workflows.clip_frames import with_frames
 from skyquilt.workflows.finished import Earlier
@@ -245,6 +246,14 @@ def find_ground(
         earlier = aligned.earlier.map_of(aligned.photos, clock.store, output)
     marks = aligned.links.marks
     shown = {name: marked(mask, marks.cell_px[name]) for name, mask in marks.masks.items()}
+    keys = [p.camera_key for p in aligned.photos]
+    yielding, notes = spoilt_parts(
+        aligned.alignment,
+        aligned.found.detail,
+        aligned.found.thumbnails(sorted(aligned.alignment.poses)),
+        [p.name for p in aligned.photos],
+        {i: shown[key] for i, key in enumerate(keys) if key in shown},
+    )
     steps = ground.find_ground(
         aligned.alignment,
         aligned.grey,
@@ -256,11 +265,10 @@ def find_ground(
         pictures=picture_recipe(),
         earlier=earlier,
         see_through=[i for i, p in enumerate(aligned.photos) if p.alpha],
-        marks={
-            i: shown[p.camera_key] for i, p in enumerate(aligned.photos) if p.camera_key in shown
-        },
+        marks=yielding,
     )
-    return (yield from clock.stage("surface", steps))
+    found = yield from clock.stage("surface", steps)
+    return replace(found, notes=(*found.notes, *notes))
 
 
 def draw_map(

@@ -17,7 +17,7 @@ from skyquilt.engine.pixel_cache import Box, PhotoParts, PixelCache, Step
 from skyquilt.engine.store import Store, digest
 from skyquilt.engine.workers import Workers
 from skyquilt.errors import NoPhotosError, OutputError, PhotoFailedError, UnreadablePhotoError
-from skyquilt.imaging.grey import halved, shrink, to_grey8
+from skyquilt.imaging.grey import detail, halved, shrink, to_grey8
 from skyquilt.model.features import Features
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.outside import out_of_memory
@@ -50,11 +50,13 @@ class PhotoFeatures:
     """Keypoints."""
     thumbnail: NDArray[Any]
     """(h, w[, bands])."""
+    detail: NDArray[np.float32]
+    """(rows, columns, 3) how sharp the picture is in its cells (`imaging.grey.detail`)."""
 
     @property
     def nbytes(self) -> int:
         """Bytes in memory."""
-        return sys.getsizeof(self.features) + int(self.thumbnail.nbytes)
+        return sys.getsizeof(self.features) + int(self.thumbnail.nbytes + self.detail.nbytes)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -78,6 +80,10 @@ class FeaturedPhotos:
     def features(self) -> Sequence[Features]:
         """Features per photo; read when asked for, so that memory does not hold those of all."""
         return _FeaturesOf(self)
+
+    def detail(self, photo: int) -> NDArray[np.float32]:
+        """How sharp the picture of a photo (index) is in its cells."""
+        return self.looks.once(self.number[photo]).detail
 
     def thumbnails(self, photos: Sequence[int]) -> Mapping[int, NDArray[Any]]:
         """Thumbnails of these photos, by index; read when asked for."""
@@ -232,7 +238,7 @@ def features_key(photo: Photo, detector: Detector) -> str:
 
 def features_recipe(detector: Detector) -> tuple[Any, ...]:
     """Everything on which features and thumbnails depend, except for their photos."""
-    return detector, THUMBNAIL, *picture_recipe()
+    return detector, THUMBNAIL, detail, *picture_recipe()
 
 
 def picture_key(photo: Photo) -> str:
@@ -290,7 +296,7 @@ def _look(photo: Photo, pixels: NDArray[Any], detector: Detector, store: Store) 
     else:
         source = picture if rough.dtype == np.uint8 else shrink(rough, PICTURE)[0]
     found = detector.of_shrunken(shrink(source, longest)[0], pixels.shape[:2])
-    return PhotoFeatures(features=found, thumbnail=thumbnail_of(rough))
+    return PhotoFeatures(features=found, thumbnail=thumbnail_of(rough), detail=detail(pixels))
 
 
 def find_features(

@@ -1,0 +1,59 @@
+"""What photos show badly, so that others are drawn in their place: marks, blur, and what is
+overexposed.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.imaging.blank import Blank, around, joined
+from skyquilt.model.poses import Alignment
+from skyquilt.ortho.sharpness import find_blurred, some_names
+
+WHITE = 250
+"""Level of 255 from which a band of a reduced picture shows nothing more."""
+LEAST_WHITE = 0.02
+"""Share of a picture that is that white where it counts as overexposed: roofs and cars are less."""
+
+
+def spoilt_parts(
+    alignment: Alignment,
+    details: Callable[[int], NDArray[np.float32]],
+    thumbnails: Mapping[int, NDArray[Any]],
+    names: Sequence[str],
+    fixed: Mapping[int, Blank],
+) -> tuple[dict[int, Blank], tuple[str, ...]]:
+    """What yields to other photos, by photo (index), only of photos where something does, and
+    notes. `details` as in `find_blurred`, `thumbnails` (h, w[, bands]), `names` of the photos,
+    `fixed`: where they show marks.
+    """
+    blurred, notes = find_blurred(alignment, details, names)
+    white = dict[int, Blank]()
+    for i in sorted(alignment.poses):
+        if part := _white(alignment, i, thumbnails[i]):
+            white[i] = part
+    if white:
+        listed = some_names([names[i] for i in white])
+        some = f"{len(white)} photos are" if len(white) > 1 else "One photo is"
+        notes += (
+            f"{some} overexposed in part ({listed}): what is white there is drawn only where no"
+            " other photo shows the ground.",
+        )
+    out = dict(fixed)
+    for found in (blurred, white):
+        out |= {i: joined(out[i], b) if i in out else b for i, b in found.items()}
+    return out, notes
+
+
+def _white(alignment: Alignment, photo: int, thumbnail: NDArray[Any]) -> Blank | None:
+    """Where a photo is overexposed; None where it is not, or has no 8-bit values."""
+    if thumbnail.dtype != np.uint8:
+        return None
+    lightest = thumbnail if thumbnail.ndim == 2 else thumbnail.max(2)
+    white = np.asarray(lightest >= WHITE)
+    if white.mean() <= LEAST_WHITE:
+        return None
+    camera = alignment.camera(photo)
+    return around(white, (camera.width, camera.height))

@@ -1,0 +1,107 @@
+"""What is overexposed yields to other photos, together with marks and blur."""
+
+import io
+from dataclasses import replace
+
+import numpy as np
+import piexif
+import pytest
+import rasterio
+from PIL import Image
+
+from skyquilt.imaging.blank import around, joined
+from skyquilt.ortho.spoilt import spoilt_parts
+from skyquilt.settings import MosaicSettings
+from skyquilt.simulate import preset, simulate
+from skyquilt.simulate.camera import Lens
+from skyquilt.simulate.settings import Route
+from skyquilt.workflows.mosaic import mosaic
+from tests.ortho.test_sharpness import flight, seen
+
+
+def shown(alignment, thumbnails, fixed=None):
+    details = seen(alignment)
+    names = [f"{k}.jpg" for k in range(len(details))]
+    return spoilt_parts(alignment, lambda k: details[k], thumbnails, names, fixed or {})
+
+
+def plain(count):
+    return {k: np.full((192, 256, 3), 120, np.uint8) for k in range(count)}
+
+
+def test_white_parts_yield_and_are_named():
+    alignment, thumbnails = flight(12), plain(12)
+    thumbnails[4][50:100, 20:120, 0] = 252  # one band is enough
+    thumbnails[7][:3, :3] = 255  # a white car
+    marks, notes = shown(alignment, thumbnails)
+    assert list(marks) == [4]
+    px = np.array([[20.0, 120.0], [110.0, 120.0], [300.0, 250.0]])  # of 400 x 300
+    assert (marks[4].at(*px.T) < 0).tolist() == [False, True, False]
+    assert notes == (
+        "One photo is overexposed in part (4.jpg): what is white there is drawn only where no other"
+        " photo shows the ground.",
+    )
+
+
+def test_values_of_more_than_eight_bits_are_not_judged():
+    alignment = flight(12)
+    thumbnails = {k: np.full((192, 256), 65535, np.uint16) for k in range(12)}
+    assert shown(alignment, thumbnails) == ({}, ())
+
+
+def test_marks_stay_beside_what_is_white():
+    alignment, thumbnails = flight(12), plain(12)
+    thumbnails[4][50:100, 20:120] = 255
+    logo = np.zeros((30, 40), bool)
+    logo[22:26, 25:30] = True
+    fixed = {k: around(logo, (400, 300)) for k in range(12)}
+    marks, _ = shown(alignment, thumbnails, fixed)
+    assert sorted(marks) == list(range(12))
+    px = np.array([[110.0, 120.0], [275.0, 240.0], [330.0, 60.0]])
+    assert (marks[4].at(*px.T) < 0).tolist() == [True, True, False]
+    assert (marks[5].at(*px.T) < 0).tolist() == [False, True, False]
+
+
+def test_parts_joined_are_those_of_either_at_any_resolution():
+    left, top = np.zeros((30, 40), bool), np.zeros((60, 80), bool)
+    left[:, :10], top[:15] = True, True
+    both = joined(around(left, (400, 300)), around(top, (400, 300)))
+    u, v = np.meshgrid(np.arange(0, 400, 5.0), np.arange(0, 300, 5.0))
+    away = (np.abs(u - 100) > 25) & (np.abs(v - 75) > 25)  # not at their rims
+    assert np.array_equal((both.at(u, v) < 0)[away], ((u < 100) | (v < 75))[away])
+
+
+def lightened(path, factor):
+    """The photo as a longer exposure shows it, with its metadata."""
+    image = Image.open(path)
+    linear = (np.asarray(image) / 255.0) ** 2.2 * factor
+    pixels = (255 * np.minimum(linear, 1) ** (1 / 2.2)).astype(np.uint8)
+    held = io.BytesIO()
+    xmp = image.info.get("xmp")
+    Image.fromarray(pixels).save(
+        held, "JPEG", quality=92, exif=piexif.dump(piexif.load(image.info["exif"])), xmp=xmp
+    )
+    path.with_name(f"{path.stem}_over.jpg").write_bytes(held.getvalue())
+
+
+@pytest.mark.slow
+def test_the_map_of_a_bracket_is_not_white_where_the_ground_is_not(tmp_path):
+    settings = replace(
+        preset("default"),
+        seed=74,
+        lens=Lens().scaled(640, 480),
+        route=Route(photos=12),
+        thermal=None,
+    )
+    list(simulate(settings, tmp_path / "flight"))
+    photos = tmp_path / "flight" / "photos"
+    for path in sorted(photos.glob("*.jpg")):
+        lightened(path, 5.0)
+    mosaic(photos, tmp_path / "map", MosaicSettings(jobs=1))
+    with rasterio.open(tmp_path / "map" / "mosaic.tif") as source:
+        bands, inside = source.read([1, 2, 3]).astype(float), source.read_masks(1) > 0
+    h, w = (n // 8 * 8 for n in inside.shape)
+    squares = bands[:, :h, :w].reshape(3, h // 8, 8, w // 8, 8).std((2, 4)).min(0)
+    whole = inside[:h, :w].reshape(h // 8, 8, w // 8, 8).all((1, 3))
+    # a band that is clipped has no noise: 0.003 of the squares without the mend
+    assert (squares[whole] < 0.7).mean() < 0.001

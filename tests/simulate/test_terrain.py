@@ -1,0 +1,120 @@
+"""Kinds of terrain: their shapes by formula, what stands on them, and waves that move."""
+
+from typing import get_args
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from skyquilt.cli.main import app
+from skyquilt.cli.simulate import TerrainName
+from skyquilt.simulate.expose import exposer
+from skyquilt.simulate.flight import Shot, Waypoint
+from skyquilt.simulate.grid import Grid
+from skyquilt.simulate.ground import Ground
+from skyquilt.simulate.noise import Noise
+from skyquilt.simulate.scene import Country, SceneSettings, empty_scene
+from skyquilt.simulate.settings import Pictures
+from skyquilt.simulate.terrain import DECK_M, WATER_M, Terrain
+from skyquilt.simulate.weather import Weather
+from tests.simulate.test_geometry import LENS
+
+BOUNDS = (-110.0, -110.0, 110.0, 110.0)
+
+
+def country(kind: Terrain) -> Country:
+    return Country(settings=SceneSettings(kind=kind), bounds=BOUNDS, seed=5)
+
+
+def added(kind: Terrain, x: float, y: float) -> float:
+    """By how much a place is higher than with hills only."""
+    hills = Ground(noise=Noise(seed=5), relief=6.0)
+    return Ground(noise=Noise(seed=5), relief=6.0, kind=kind).at(x, y) - hills.at(x, y)
+
+
+@pytest.mark.parametrize(
+    ("kind", "place", "higher"),
+    [
+        ("cliff", (-30, 8), 0.0),
+        ("cliff", (30, 8), -45.0),
+        ("quarry", (3, 2), -36.0),
+        ("quarry", (80, 0), 0.0),
+        ("bridge", (0, 20 * np.pi), -22.0),
+        ("bridge", (0, 0.9 * DECK_M), 0.0),
+        ("slope", (20, 70 * np.arctanh(0.5)), -20.0),
+        ("slope", (-50, -70 * np.arctanh(0.5)), 20.0),
+        ("town", (10, 10), 0.0),
+        ("bare", (10, 10), 0.0),
+    ],
+)
+def test_ground_is_shaped_as_stated(kind, place, higher):
+    assert added(kind, *place) == pytest.approx(higher, abs=1e-3)
+
+
+def test_a_mountain_side_falls_by_thirty_degrees():
+    fall = (added("slope", 0, -2) - added("slope", 0, 2)) / 4
+    assert np.degrees(np.arctan(fall)) == pytest.approx(30, abs=0.5)
+
+
+@pytest.mark.parametrize("kind", ["cliff", "quarry", "bridge", "shore", "slope"])
+def test_a_window_has_the_heights_of_its_points(kind):
+    """Cells as small as a photo's are no smoother than the shape: a wall stays a wall."""
+    ground = country(kind).ground
+    window = Grid(left=-8.0, top=8.0, res=0.1, width=160, height=160)
+    heights = ground.heights(window)
+    rng = np.random.default_rng(0)
+    for row, col in rng.integers(0, 160, (12, 2)):
+        point = ground.at(float(window.xs[col]), float(window.ys[row]))
+        assert heights[row, col] == pytest.approx(point, abs=0.03)
+
+
+def test_a_lake_is_level_and_nothing_stands_in_it():
+    shore = country("shore")
+    lake = shore.ground.heights(Grid(left=-100.0, top=50.0, res=1.0, width=60, height=100))
+    assert (lake == np.float32(WATER_M)).all()
+    assert shore.ground.at(60, 0) > WATER_M + 5
+    things = [*shore.layout.trees, *shore.layout.houses, *shore.layout.cars]
+    assert len(things) > 100
+    assert all(shore.ground.at(thing.x, thing.y) > WATER_M for thing in things)
+    assert len(country("landscape").layout.trees) > len(shore.layout.trees)
+
+
+def test_a_town_has_tall_houses_and_bare_land_none():
+    eaves = [house.eave for house in country("town").layout.houses]
+    assert len(eaves) > 40
+    assert min(eaves) >= 10
+    assert max(eaves) > 28
+    bare = country("bare").layout
+    assert not bare.houses
+    assert {parcel.kind for parcel in bare.parcels} == {"bare", "stubble"}
+
+
+def test_waves_move_from_photo_to_photo_and_the_shore_does_not(tmp_path):
+    shore, weather = country("shore"), Weather()
+    scene = empty_scene(shore.grid(0.25), thermal=False, scratch=tmp_path, water=WATER_M)
+    list(shore.draw(scene, weather, scratch=tmp_path))
+    way = Waypoint(x=-5.0, y=0.0, heading=0.0, line=0)
+    shot = Shot(name="a", waypoint=way, centre=(-5.0, 0.0, 60.0), yaw=0.0, pitch=0.0, roll=0.0)
+    camera = exposer(scene, LENS.scaled(320, 240))
+    clean = Pictures(exposure_noise=0, vignetting=0, noise=0)
+    first, second = (
+        camera.visible(shot, clean, 1.0, np.random.default_rng(k)).mean(axis=2) for k in (1, 2)
+    )
+    hits, heights, _ = camera.pixels(shot)
+    water = heights < WATER_M + 0.01
+    assert 0.2 < water.mean() < 0.8
+    land = cv2.erode((heights > WATER_M + 0.1).astype(np.uint8), np.ones((9, 9))) > 0
+    assert np.array_equal(first[land], second[land])
+    assert np.corrcoef(first[water], second[water])[0, 1] < 0.5
+    assert first[water].std() > 8
+
+
+def test_a_cliff_is_flown_and_low_flights_are_refused(tmp_path):
+    assert get_args(TerrainName) == get_args(Terrain)
+    words = ["--terrain", "cliff", "--photos", "2", "--size", "200x150", "--quiet"]
+    low = CliRunner().invoke(app, ["simulate", str(tmp_path / "a"), *words, "--height", "60"])
+    assert low.exit_code != 0
+    assert "at least 70 m over cliff" in str(low.exception)
+    high = CliRunner().invoke(app, ["simulate", str(tmp_path / "b"), *words, "--height", "70"])
+    assert high.exit_code == 0, high.output
