@@ -49,10 +49,12 @@ class FramePattern:
     """
     bend: float = 0.3
     """Weight of a node's second differences, as a share of the differences that it lies in."""
-    apart: float = 0.03
+    apart: float = 0.3
     """The same of its difference from these rings."""
-    gain: float = 0.05
-    """Share of the differences (median) that it must explain in frames it does not know."""
+    gain: float = 0.03
+    """Share of the differences (median) that it must explain in frames it does not know: where
+    there was no pattern, the share was below 0.
+    """
     fewest: int = 8
     """Frames, at least: four in either half."""
     rounds: int = 6
