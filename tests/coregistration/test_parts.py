@@ -122,6 +122,20 @@ def test_everywhere_has_the_truth_among_its_best(degrees):
     )
 
 
+@pytest.mark.parametrize("corner", [(0, 0), (256, 0), (256, 304)])
+def test_a_part_is_found_in_every_corner_of_the_whole(corner):
+    """An eighth of the area, in another spectrum; the whole must lie in the plane with its rim."""
+    one, other = pair(np.eye(3), seed=6)
+    top, left = corner
+    whole = of(one, 160.0)
+    part = of(np.ascontiguousarray(other[top : top + 144, left : left + 176]), 80.0)
+    truth = between(part, whole, np.array([[1.0, 0, left], [0, 1, top], [0, 0, 1]]))
+    search = Everywhere(turns=0.85, smallest=1 / 2.9, largest=1 / 1.45, overlap=0.6)
+    best = distinct(search(part, whole), part.shape, 3, 3)
+    off = [corners(c.b_H_a, part.shape) - corners(truth, part.shape) for c in best]
+    assert min(np.linalg.norm(o, axis=1).max() for o in off) < 5
+
+
 def test_nearby_finds_what_lies_near_a_guess():
     truth = turned_by(1.1, 4.0, SHAPE, SHAPE, (25, -18))
     a, b = (of(p, 128.0) for p in pair(truth, seed=2))

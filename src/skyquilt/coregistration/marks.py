@@ -32,7 +32,7 @@ class Marks:
     certain: NDArray[np.uint8]
     """1 at marks and beside them, else 0."""
     likely: NDArray[np.uint8]
-    """1 also at thin strokes that both have."""
+    """1 also at thin strokes that both have, where the pictures differ in size."""
     possible: NDArray[np.uint8]
     """1 also at what may be marks, or alike by chance."""
 
@@ -79,6 +79,8 @@ class FindMarks:
     more than the second share of it; else the pictures themselves are alike. With marks it was 0.1
     at most, for a picture and itself with noise 0.47 at least.
     """
+    one_size: float = 0.02
+    """Largest difference in size up to which marks have one brightness and one width in both."""
     beside: float = 0.06
     """The shift, as a share of the picture's sides."""
 
@@ -107,7 +109,9 @@ class FindMarks:
         if contrast > least and certain.mean() > share * contrast:
             return None
         marks = self._touching(alike >= self.near, certain)
-        strokes = self._strokes(one[0], other[0])
+        strokes = np.zeros(marks.shape, bool)
+        if abs(a.shape[1] / b.shape[1] - 1) > self.one_size:
+            strokes = self._strokes(one[0], other[0])
         return Marks(
             certain=_widened(marks, self.reach[0]),
             likely=_widened(marks | strokes, self.reach[0]),
