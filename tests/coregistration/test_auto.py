@@ -171,6 +171,15 @@ def test_what_shows_nothing_is_refused_by_every_method(what, method):
         assert reason in refused.reason and f"picture {name}" in refused.reason
 
 
+@pytest.mark.parametrize("method", ["auto", "structure"])
+def test_what_has_no_place_for_a_keypoint_is_refused(method):
+    """Measurements in a lattice of strips, too narrow for any keypoint, but a quarter of all."""
+    rows, columns = np.indices(SHAPE)
+    strips = Picture(values=SCENE, valid=(rows % 24 < 4) | (columns % 24 < 4))
+    for a, b in ((strips, Picture(values=SCENE)), (Picture(values=SCENE), strips)):
+        assert not registration_method(method)(a, b)
+
+
 @pytest.mark.slow
 def test_noise_is_refused(auto):
     rng = np.random.default_rng(0)

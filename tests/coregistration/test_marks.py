@@ -65,6 +65,42 @@ def test_unrelated_pictures_are_not_registered_by_marks(auto, seed):
     assert "significance" in found.reason or "marks" in found.reason or "position" in found.reason
 
 
+def drawn(grey):
+    """A smaller picture with the same marks, drawn at its own size: lines of one px, other text."""
+    height, width = grey.shape
+    by = width / SHAPE[1]
+    picture = np.ascontiguousarray(grey).copy()
+
+    def text(x, y, words, size=0.5):
+        at, font = (round(x * by), round(y * by)), cv2.FONT_HERSHEY_SIMPLEX
+        cv2.putText(picture, words, at, font, size * by, 0, 3, cv2.LINE_AA)
+        cv2.putText(picture, words, at, font, size * by, 255, 1, cv2.LINE_AA)
+
+    text(12, 24, "2026-05-14 10:22:41")
+    text(12, 388, "D 243m H 120m HS 8.2 VS 0.1")
+    text(330, 24, "REC 00:12:44")
+    text(400, 388, "FLIR", 0.8)
+    for k in range(10):
+        text(60, 84 + 26 * k, str(10 * k), 0.35)
+    box = [round(v * by) for v in (160, 130, 310, 270)]
+    cv2.rectangle(picture, box[:2], box[2:], 255, 1)
+    for k in range(14):
+        x = round((110 + 20 * k) * by)
+        cv2.line(picture, (x, round(40 * by)), (x, round((48 + 6 * (k % 2)) * by)), 255, 1)
+    middle = (round(230 * by), round(200 * by))
+    cv2.drawMarker(picture, middle, 255, cv2.MARKER_CROSS, round(60 * by), 1)
+    _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 90])
+    return cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+
+
+@pytest.mark.parametrize("seed", [0, *(pytest.param(s, marks=pytest.mark.slow) for s in (2, 3))])
+def test_marks_in_pictures_of_other_sizes_register_nothing(auto, seed):
+    small = cv2.resize(bare(seed + 20, 0.2), None, fx=0.6, fy=0.6, interpolation=cv2.INTER_AREA)
+    a, b = (Picture(values=drawn(v)) for v in (bare(seed, 0.2), small))
+    assert auto.method(a, b)  # without the search for marks, these are what is found
+    assert not auto(a, b)
+
+
 @pytest.mark.parametrize("seed", [0, *(pytest.param(s, marks=pytest.mark.slow) for s in (1, 2))])
 def test_the_scene_is_registered_in_spite_of_marks(auto, seed):
     truth = turned(1.05, 8.0 - 5 * seed, SHAPE, SHAPE, (15.0, -12.0))

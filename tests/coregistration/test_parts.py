@@ -16,7 +16,7 @@ from skyquilt.coregistration.candidates import (
     similarity,
 )
 from skyquilt.coregistration.decision import distinctness
-from skyquilt.coregistration.everywhere import Everywhere, _Plane
+from skyquilt.coregistration.everywhere import Everywhere, _Plane, highest
 from skyquilt.coregistration.orientation import (
     between,
     full_size,
@@ -79,25 +79,32 @@ def test_spectra_are_those_of_complex_fields(scene):
     assert np.abs(spectra(fields, (64, 64))[0] - first).max() < 1e-3 * np.abs(first).max()
 
 
-@pytest.mark.parametrize("turn", [0.0, np.pi])
-def test_a_correlation_is_the_sum_over_the_overlap(scene, turn):
-    """One place of the FFT's surface against the warp and the sum written out, both halves of the
+@pytest.mark.parametrize("quarter", range(4))
+def test_a_correlation_is_the_sum_over_the_overlap(scene, quarter):
+    """One place of the FFT's surface against the warp and the sum written out, all quarters of a
     turn.
     """
     a, b = of(scene, 60.0), of(scene[30:, 20:], 60.0)
     plane, scale, angle = _Plane.of(a, b), 1.1, 0.4
-    fields = {t > angle: (f, o) for t, f, o in plane.correlations(a, scale, angle)}
-    field, overlap = fields[turn > 0]
+    field, overlap = (of_all[quarter] for of_all in plane.correlations(a, scale, angle))
+    turn = quarter * np.pi / 2
     middle = np.array([(a.shape[1] - 1) / 2, (a.shape[0] - 1) / 2])
-    for x, y in ((0, 0), (5, plane.side - 7), (plane.side - 11, 3)):
-        place = plane.place(x, y, flipped=turn > 0)
+    for x, y in ((0, 0), (4, plane.side - 8), (plane.side - 12, 4)):
+        place = plane.place(x, y, quarter)
         moved, valid = warped(a, similarity(scale, angle + turn, middle, place), b.shape)
         assert field[y, x] == pytest.approx(
             (moved * b.fields).sum(dtype=float), abs=0.03 * float(np.abs(field).max())
         )
-        assert overlap[y, x] == pytest.approx(
+        assert overlap[y // 4, x // 4] == pytest.approx(
             float((valid * b.valid).sum()), rel=0.15
         )  # counted on a grid of 4 px
+
+
+def test_the_highest_peaks_of_many_fields_are_those_of_each():
+    z = np.random.default_rng(3).normal(size=(4, 40, 56)).astype(np.float32)
+    z[2] = -1  # nothing above 0
+    each = [(k, *p) for k, one in enumerate(z) for p in peaks(one.copy(), 3)]
+    assert sorted(highest(z.copy(), 3)) == sorted(each)
 
 
 @pytest.mark.parametrize("degrees", [205.0])
@@ -113,6 +120,20 @@ def test_everywhere_has_the_truth_among_its_best(degrees):
         )
         < 4
     )
+
+
+@pytest.mark.parametrize("corner", [(0, 0), (256, 0), (256, 304)])
+def test_a_part_is_found_in_every_corner_of_the_whole(corner):
+    """An eighth of the area, in another spectrum; the whole must lie in the plane with its rim."""
+    one, other = pair(np.eye(3), seed=6)
+    top, left = corner
+    whole = of(one, 160.0)
+    part = of(np.ascontiguousarray(other[top : top + 144, left : left + 176]), 80.0)
+    truth = between(part, whole, np.array([[1.0, 0, left], [0, 1, top], [0, 0, 1]]))
+    search = Everywhere(turns=0.85, smallest=1 / 2.9, largest=1 / 1.45, overlap=0.6)
+    best = distinct(search(part, whole), part.shape, 3, 3)
+    off = [corners(c.b_H_a, part.shape) - corners(truth, part.shape) for c in best]
+    assert min(np.linalg.norm(o, axis=1).max() for o in off) < 5
 
 
 def test_nearby_finds_what_lies_near_a_guess():

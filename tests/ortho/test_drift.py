@@ -2,12 +2,17 @@
 alone.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from skyquilt.model.raster import Window
 from skyquilt.ortho.drift import Drift, Overlaps, overlaps, solved
 from skyquilt.ortho.exposure import NEUTRAL, Exposure
+from skyquilt.ortho.frame_pattern import medians, sized
+from skyquilt.ortho.radiometry import drift_of
+from skyquilt.settings import PictureSettings
 from tests.ortho.scenes import FLAT, GRID, block, composer, photograph, view
 
 
@@ -148,3 +153,65 @@ def test_frames_without_company_are_left_alone():
     frames = {0: heat(one), 1: heat(one)}
     assert Drift()([one], frames, FLAT, GRID.bounds) == {}
     assert Drift()([one, far], frames, FLAT, GRID.bounds) == {}
+
+
+Y, X = np.mgrid[:300, :400]
+RING = (2.5 * np.exp(-(((np.hypot(X - 200, Y - 150) / 250 - 0.4) / 0.12) ** 2))).astype(np.float32)
+
+
+def strip(count=12):
+    """Frames of one straight line, 70 % overlap, with drift and noise; what is true of each."""
+    views = [view(k, -24 + 4.4 * k, 0.5 * (k % 3), yaw=85 + k % 4) for k in range(count)]
+    rng = np.random.default_rng(5)
+    offset = rng.normal(0, 1.0, count)
+    noise = rng.normal(0, 0.1, (count, 300, 400)).astype(np.float32)
+    return views, {v.photo: heat(v) + np.float32(offset[v.photo]) + noise[v.photo] for v in views}
+
+
+def test_a_ring_common_to_all_frames_is_found():
+    views, frames = strip()
+    ringed = {k: f + RING for k, f in frames.items()}
+    found = Drift().patterns(views, ringed, FLAT, GRID.bounds)
+    assert list(found) == [v.photo for v in views]
+    left = RING + sized(found[0], RING.shape)
+    assert RING.std() > 0.7
+    assert left.std() < 0.2 * RING.std()
+
+
+def test_frames_without_a_pattern_have_none():
+    views, frames = strip()
+    assert Drift().patterns(views, frames, FLAT, GRID.bounds) == {}
+
+
+def test_what_half_of_the_frames_show_is_no_pattern():
+    """A ring that comes with a new calibration halfway is not the camera's."""
+    views, frames = strip()
+    half = {k: f + RING * (k >= 6) for k, f in frames.items()}
+    assert Drift().patterns(views, half, FLAT, GRID.bounds) == {}
+
+
+def test_a_map_of_ringed_frames_has_no_rings():
+    views, frames = strip()
+    ringed = {k: f + RING for k, f in frames.items()}
+
+    def levels(pictures):
+        return drift_of(views, pictures, FLAT, GRID.bounds, "celsius", Drift(), PictureSettings())
+
+    def drawn(pictures, exposure):
+        window = Window(row=0, column=0, height=GRID.height, width=GRID.width)
+        made = composer(views, pictures, GRID, exposure=exposure, dtype=np.float32)(window)
+        values = np.where(made.photo >= 0, made.pixels[..., 0], np.nan)
+        return values - np.nanmedian(values)
+
+    found = levels(ringed)
+    assert len(found.patterns) == len(views)
+    clean = drawn(frames, levels(frames))
+    kept, mended = (drawn(ringed, e) - clean for e in (replace(found, patterns={}), found))
+    assert np.nanstd(mended) < np.nanstd(kept) / 3
+
+
+def test_medians_of_groups_are_numpys():
+    rng = np.random.default_rng(1)
+    values, group = rng.normal(size=400), rng.integers(0, 37, 400)
+    expected = np.array([np.median(values[group == g]) for g in group])
+    assert medians(values, group) == pytest.approx(expected)

@@ -24,8 +24,10 @@ from skyquilt.papers.rfae import (
     binary_edges,
     gradient_magnitude,
     noise_threshold,
+    off_rims,
     surf,
 )
+from skyquilt.papers.surf import Surf
 from skyquilt.quality.registration_quality import spread_quality
 from tests.coregistration.scenes import error, layout, spectrum, turned
 
@@ -277,3 +279,22 @@ def test_one_way_matching_against_a_loop():
     assert list(zip(found.index_a.tolist(), found.index_b.tolist(), strict=True)) == expected
     assert 0 < len(expected) < 40
     assert not len(OneWay()(a, features(1)))
+
+
+def test_outlines_of_maps_register_nothing():
+    """Two smooth maps of different ground with one outline: its corners are no features."""
+    rows, columns = np.indices((300, 360))
+    outline = (np.abs(rows - 150) < 60) | (np.abs(columns - 150) < 70)
+    outline |= (rows > 40) & (columns < 120) & ((columns // 25 + rows // 35) % 2 == 0)
+    maps = []
+    for seed in (1, 2):
+        rough = np.random.default_rng(seed).normal(size=(300, 360))
+        smooth = ndimage.gaussian_filter(rough, 30)
+        smooth *= 5 / np.ptp(smooth)
+        maps.append(Picture(values=np.where(outline, 100 + smooth, np.nan).astype(np.float32)))
+    assert not registration_method("surf")(*maps)
+    features = Surf()(maps[0].values)
+    kept = off_rims(features, maps[0])
+    assert len(features) > 20 and len(kept) < len(features)
+    x, y = np.rint(kept.px).astype(int).T
+    assert outline[y, x].all()

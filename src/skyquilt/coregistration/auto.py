@@ -1,8 +1,10 @@
 """Registration by image structure, coarse to fine; accepted only if independent patches agree."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
+
+import numpy as np
 
 from skyquilt.coregistration.candidates import Candidate, Nearby, distinct, same_view
 from skyquilt.coregistration.common_part import common_part
@@ -30,14 +32,12 @@ class Auto:
     """Structure matches."""
     everywhere: Everywhere = field(default_factory=Everywhere)
     """Search without prior knowledge."""
-    larger: Everywhere = field(
-        default_factory=lambda: Everywhere(smallest=1 / 2.9, largest=1 / 1.45, overlap=0.6)
+    within: Everywhere = field(
+        default_factory=lambda: Everywhere(
+            turns=0.85, smallest=1 / 2.9, largest=1 / 1.45, overlap=0.6
+        )
     )
-    """Search for a as a part of b."""
-    smaller: Everywhere = field(
-        default_factory=lambda: Everywhere(smallest=1.45, largest=2.9, overlap=0.6)
-    )
-    """Search for b as a part of a."""
+    """Search for one as a part of the other."""
     parts: int = 2
     """Places of both that are tried."""
     nearby: Nearby = field(default_factory=Nearby)
@@ -52,7 +52,7 @@ class Auto:
     """
     sure: float = 6.0
     """Agreement above which nothing else is tried."""
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
 
     def __call__(self, a: Picture, b: Picture, guess: Guess | None = None) -> Outcome:
         """The registration of b to a, or the reason why there is none.
@@ -93,21 +93,28 @@ class Auto:
         its area. Each of the best places is a guess, so that the same ground is compared.
         """
         side, places = self.sides[_SEARCH], []
-        for search, sides in ((self.larger, (side, 2 * side)), (self.smaller, (2 * side, side))):
-            one, other = (
-                orientation(p.grey, p.valid, s) for p, s in zip(pictures, sides, strict=True)
+        for pair, swapped in ((pictures, False), (pictures[::-1], True)):
+            whole, part = (
+                orientation(p.grey, p.valid, s) for p, s in zip(pair, (2 * side, side), strict=True)
             )
-            for c in _sifted(one, other, search(one, other)):
-                score = distinctness(one, other, c.b_H_a)
-                places.append(Candidate(b_H_a=full_size(one, other, c.b_H_a), score=score))
-        found: list[Outcome] = []
+            # the part is turned and the whole stays, so that all of it lies in the plane
+            found = [replace(c, b_H_a=_inverse(c.b_H_a)) for c in self.within(part, whole)]
+            for c in _sifted(whole, part, found):
+                full = full_size(whole, part, c.b_H_a)
+                places.append(
+                    Candidate(
+                        b_H_a=_inverse(full) if swapped else full,
+                        score=distinctness(whole, part, c.b_H_a),
+                    )
+                )
+        outcomes: list[Outcome] = []
         for place in distinct(places, a.shape, _APART * max(a.shape), self.parts):
             guess = Guess(b_H_a=place.b_H_a, reach=0.05, rotation_deg=4.0, scale=1.08)
-            found.append(self._guided(a, b, guess))
-            if found[-1].evidence.get("surprise", 0.0) >= self.sure:
+            outcomes.append(self._guided(a, b, guess))
+            if outcomes[-1].evidence.get("surprise", 0.0) >= self.sure:
                 break
         none = RefusedRegistration(reason="no part of one image was found in the other")
-        return max(found, key=lambda o: (bool(o), o.evidence.get("surprise", 0.0)), default=none)
+        return max(outcomes, key=lambda o: (bool(o), o.evidence.get("surprise", 0.0)), default=none)
 
     def _near(self, pyramid: Pyramid, guess: Guess) -> list[Matrix]:
         """Candidate transforms near a guess, in px of the selection level."""
@@ -132,6 +139,10 @@ class Auto:
         ]
         kept = distinct([Candidate(b_H_a=f.b_H_a, score=f.score) for f in fits], a.shape, 2, 3)
         return [f for f in fits if any(f.b_H_a is c.b_H_a for c in kept)]
+
+
+def _inverse(matrix: Matrix) -> Matrix:
+    return np.asarray(np.linalg.inv(matrix), np.float64)
 
 
 def _sifted(a: Orientation, b: Orientation, found: Sequence[Candidate]) -> list[Candidate]:

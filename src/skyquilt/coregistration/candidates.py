@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from skyquilt.coregistration.orientation import Orientation, between, spectra, turned
 from skyquilt.model.registration import Guess, Matrix
 
-_SUPPRESS = 4
+SUPPRESS = 4
 """Radius in px around a peak in which no other peak is searched."""
 
 
@@ -76,7 +76,7 @@ def middle(shape: tuple[int, int]) -> np.ndarray:
 def peaks(z: NDArray[np.float32], most: int) -> Iterator[tuple[float, int, int]]:
     """The highest peaks (score, x, y) of a field that wraps around; the field is modified."""
     height, width = z.shape
-    near = np.arange(-_SUPPRESS, _SUPPRESS + 1)
+    near = np.arange(-SUPPRESS, SUPPRESS + 1)
     for _ in range(most):
         y, x = divmod(int(z.argmax()), width)
         if z[y, x] <= 0:

@@ -131,6 +131,8 @@ class IndexFeatures:
 def index_features(phase: Phase, valid: NDArray[Any], *, count: int, patch: int) -> IndexFeatures:
     """The strongest keypoints, spread out, with descriptors of patches of `patch` px."""
     px = _keypoints(phase, valid, count)
+    if not len(px):  # OpenCV refuses to resample at no places
+        return IndexFeatures(px=px, vectors=np.zeros((0, CELLS**2, ORIENTATIONS), np.float32))
     share = [
         cv2.blur(((phase.index == k) * valid).astype(np.float32), (patch // CELLS,) * 2)
         for k in range(ORIENTATIONS)

@@ -10,6 +10,7 @@ structure have equal weight.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -53,6 +54,26 @@ class Orientation:
     def shape(self) -> tuple[int, int]:
         """Height and width in px."""
         return self.fields.shape[0], self.fields.shape[1]
+
+    @cached_property
+    def channels(self) -> NDArray[np.float32]:
+        """(4, h, w) the fields."""
+        return channels(self.fields)
+
+    @cached_property
+    def strength(self) -> NDArray[np.float32]:
+        """(h, w) sum of the squares of the fields."""
+        return strength(self.fields)
+
+
+def channels(fields: Fields) -> NDArray[np.float32]:
+    """(4, h, w) fields."""
+    return np.ascontiguousarray(np.moveaxis(fields, -1, 0))
+
+
+def strength(fields: Fields) -> NDArray[np.float32]:
+    """(h, w) sum of the squares of fields."""
+    return np.asarray(np.einsum("ijk,ijk->ij", fields, fields))
 
 
 def orientation(

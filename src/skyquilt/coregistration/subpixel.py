@@ -11,7 +11,7 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.coregistration.orientation import Fields, Orientation, warped
+from skyquilt.coregistration.orientation import Fields, Orientation, channels, strength, warped
 from skyquilt.model.registration import Matrix
 
 Freedom = Literal["similarity", "affine", "homography"]
@@ -52,7 +52,7 @@ class SubpixelRefinement:
     """Type of the transform."""
     steps: int = 6
     """Largest number of steps."""
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     def __call__(self, a: Orientation, b: Orientation, b_H_a: Matrix) -> Fit:
         """The best transform near a given one; the given one itself if none is better."""
@@ -82,8 +82,8 @@ def _tried(
     fields, valid = warped(a, b_H_a, b.shape)
     both = valid * b.valid
     product = float(np.vdot(fields, b.fields))
-    energy_a = float(np.einsum("ijk,ijk,ij->", fields, fields, b.valid))
-    energy_b = float(np.einsum("ijk,ijk,ij->", b.fields, b.fields, valid))
+    energy_a = float(np.vdot(strength(fields), b.valid))
+    energy_b = float(np.vdot(b.strength, valid))
     correlation = product / np.sqrt(energy_a * energy_b + _TINY)
     return (
         Fit(b_H_a=b_H_a, correlation=float(correlation), overlap=float(both.sum())),
@@ -134,16 +134,17 @@ def _change(
     fields: Fields, valid: NDArray[np.float32], b: Orientation, frame: _Frame, freedom: Freedom
 ) -> NDArray[np.float64] | None:
     """The step's parameters; None if the overlap is too small or there is no correlation."""
-    inside = (valid * b.valid) > 0.5
+    inside = ((valid * b.valid) > 0.5).astype(np.float32)
     if inside.sum() < _LEAST:
         return None
-    J = _derivatives(fields, inside, frame, freedom)
-    w, target = fields[inside].ravel(), b.fields[inside].ravel()
+    moved = channels(fields) * inside
+    J = _derivatives(channels(fields), moved, inside, frame, freedom)
+    w, target = moved.ravel(), b.channels.ravel()
     H = (J @ J.T).astype(np.float64)
     H += 1e-4 * np.trace(H) / len(H) * np.eye(len(H))
     Jw, Jb = (J @ w).astype(np.float64), (J @ target).astype(np.float64)
     projected = np.linalg.solve(H, Jw)
-    own, cross = float(w @ w) - Jw @ projected, float(target @ w) - Jb @ projected
+    own, cross = float(w @ w - Jw @ projected), float(target @ w - Jb @ projected)
     if (
         cross <= 0
     ):  # only the shift explains it: second case of Evangelidis and Psarakis, simplified
@@ -154,19 +155,22 @@ def _change(
 
 
 def _derivatives(
-    fields: Fields, inside: NDArray[np.bool_], frame: _Frame, freedom: Freedom
+    w: NDArray[np.float32],
+    moved: NDArray[np.float32],
+    inside: NDArray[np.float32],
+    frame: _Frame,
+    freedom: Freedom,
 ) -> NDArray[np.float32]:
-    """Derivatives (parameters, 4 n) of the warped fields at n pixels."""
-    gx, gy = np.zeros_like(fields), np.zeros_like(fields)
-    np.subtract(fields[:, 2:], fields[:, :-2], out=gx[:, 1:-1])
-    np.subtract(fields[2:], fields[:-2], out=gy[1:-1])
-    gx, gy, w = gx[inside] / 2, gy[inside] / 2, fields[inside]
-    x, y = frame.x[inside][:, None], frame.y[inside][:, None]
+    """Derivatives (parameters, 4 h w) of the warped fields w (4, h, w), 0 outside; `moved`: w, 0
+    outside.
+    """
+    J = np.zeros((_PARAMETERS[freedom], *w.shape), np.float32)
+    np.subtract(w[:, :, :-2], w[:, :, 2:], out=J[0, :, :, 1:-1])
+    np.subtract(w[:, :-2], w[:, 2:], out=J[1, :, 1:-1])
+    J[:2] *= inside / 2
+    x, y = frame.x, frame.y
     # change of the fields by the rotation of orientations, per px of shift at unit distance
-    turn = np.stack([-w[:, 1], w[:, 0], -2 * w[:, 3], 2 * w[:, 2]], -1) / np.float32(frame.unit)
-    J = np.empty((_PARAMETERS[freedom], *w.shape), np.float32)
-    np.negative(gx, out=J[0])
-    np.negative(gy, out=J[1])
+    turn = moved[[1, 0, 3, 2]] * (np.array([-1, 1, -2, 2], np.float32) / frame.unit)[:, None, None]
     if freedom == "similarity":
         J[2] = J[0] * x + J[1] * y
         J[3] = J[1] * x - J[0] * y + 2 * turn

@@ -13,6 +13,7 @@ from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.blend import Blend, Layer
 from skyquilt.ortho.exposure import NEUTRAL, Exposure, image_place, with_odds
+from skyquilt.ortho.frame_pattern import at
 from skyquilt.ortho.labels import Labels
 from skyquilt.ortho.plan import Plan, planned, stale
 from skyquilt.ortho.stepped import Closer, Finer, Part, Stepped, lifted, stepped_heights
@@ -323,7 +324,13 @@ class Composer:
     def _exposed(self, n: Nodes, warped: NDArray[Any]) -> NDArray[Any]:
         photo = n.view.photo
         if photo in self.exposure.offsets and warped.dtype.kind == "f":
-            return warped + np.float32(self.exposure.offsets[photo])
+            level = warped + np.float32(self.exposure.offsets[photo])
+            if photo not in self.exposure.patterns:
+                return level
+            camera = n.view.camera
+            own = at(self.exposure.patterns[photo], n.u, n.v, camera.width, camera.height)
+            added = densify(own, warped.shape[0], warped.shape[1], n.step)
+            return np.asarray(level + added.reshape(*warped.shape[:2], 1), warped.dtype)
         if photo not in self.exposure.gains or warped.dtype.kind != "u":
             return warped
         if warped.dtype != np.uint8 or self.exposure.uneven(photo):

@@ -6,7 +6,7 @@ correction, not a measurement; an option keeps the recorded values.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from skyquilt.imaging.nodes import View, project_nodes
 from skyquilt.model.surface import Surface
+from skyquilt.ortho.frame_pattern import FramePattern, Samples
 
 Doubles = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -53,7 +54,9 @@ class Drift:
     """Fewest points that two frames must share."""
     rounds: int = 12
     """Rounds of reweighting."""
-    version: ClassVar[int] = 2
+    pattern: FramePattern = field(default_factory=FramePattern)
+    """What frames have in common besides."""
+    version: ClassVar[int] = 3
 
     def __call__(
         self,
@@ -68,12 +71,36 @@ class Drift:
         usable = [v for v in views if v.photo in thumbnails]
         if len(usable) < 2:
             return {}
-        point, row, value = self._samples(usable, thumbnails, surface, bounds)
-        edges = overlaps(point, row, value, self.least)
+        s = self._samples(usable, thumbnails, surface, bounds)
+        edges = overlaps(s.point, s.row, s.value, self.least)
         if not len(edges.first):
             return {}
         offsets = solved(edges, len(usable), self.rounds)
         return {v.photo: float(o) for v, o in zip(usable, offsets, strict=True)}
+
+    def patterns(
+        self,
+        views: Sequence[View],
+        thumbnails: Mapping[int, NDArray[Any]],
+        surface: Surface,
+        bounds: tuple[float, float, float, float],
+    ) -> dict[int, NDArray[np.float32]]:
+        """Photo -> correction (h, w) of its values at nodes of the frame, the same for all frames
+        of a camera; without those of cameras that show none.
+        """
+        cameras: dict[tuple[float, ...], list[View]] = {}
+        for v in views:
+            if v.photo in thumbnails:
+                key = (v.camera.width, v.camera.height, *v.camera.vector)
+                cameras.setdefault(key, []).append(v)
+        found: dict[int, NDArray[np.float32]] = {}
+        for own in cameras.values():
+            if len(own) < self.pattern.fewest:
+                continue
+            pattern = self.pattern(self._samples(own, thumbnails, surface, bounds), own[0].camera)
+            if pattern is not None:
+                found |= {v.photo: pattern for v in own}
+        return found
 
     def _samples(
         self,
@@ -81,8 +108,8 @@ class Drift:
         thumbnails: Mapping[int, NDArray[Any]],
         surface: Surface,
         bounds: tuple[float, float, float, float],
-    ) -> tuple[Ints, Ints, Doubles]:
-        """Ground point, view and value (N,) of all samples."""
+    ) -> Samples:
+        """Values of views at points of the ground."""
         west, south, east, north = bounds
         step = np.sqrt((east - west) * (north - south) / max(self.points, 40 * len(views)))
         x, y = np.meshgrid(np.arange(west, east, step), np.arange(south, north, step))
@@ -91,13 +118,15 @@ class Drift:
         for row, view in enumerate(views):
             nodes = project_nodes(view, x, y, z)
             seen = np.flatnonzero(nodes.seen.ravel())
-            value = _nearest(
-                thumbnails[view.photo], nodes.u.ravel()[seen], nodes.v.ravel()[seen], view
-            )
+            u, v = nodes.u.ravel()[seen], nodes.v.ravel()[seen]
+            value = _nearest(thumbnails[view.photo], u, v, view)
             good = np.isfinite(value)
-            parts.append((seen[good], np.full(int(good.sum()), row), value[good]))
-        point, rows, values = (np.concatenate(p) for p in zip(*parts, strict=True))
-        return point.astype(np.int64), rows.astype(np.int64), values
+            place = (np.c_[u, v] + 0.5) / [view.camera.width, view.camera.height]
+            parts.append((seen[good], np.full(int(good.sum()), row), value[good], place[good]))
+        point, rows, values, places = (np.concatenate(p) for p in zip(*parts, strict=True))
+        return Samples(
+            point=point.astype(np.int64), row=rows.astype(np.int64), value=values, place=places
+        )
 
 
 def _nearest(thumbnail: NDArray[Any], u: NDArray[Any], v: NDArray[Any], view: View) -> Doubles:

@@ -202,7 +202,10 @@ def with_new(old: Exposure, fresh: Exposure) -> Exposure:
     if same := sorted(old.offsets.keys() & fresh.offsets.keys()):
         level = float(np.median([old.offsets[i] - fresh.offsets[i] for i in same]))
         offsets |= {i: o + level for i, o in fresh.offsets.items() if i not in offsets}
-    return replace(old, gains=gains, fields=fields, offsets=offsets)
+    patterns = {i: p for i, p in fresh.patterns.items() if i not in old.offsets}
+    return replace(
+        old, gains=gains, fields=fields, offsets=offsets, patterns={**old.patterns, **patterns}
+    )
 
 
 def complete(exposure: Exposure, views: Sequence[View]) -> Exposure:

@@ -57,6 +57,8 @@ class Exposure:
     """Photo -> (6,) in log odds, for x, y and r from the image's centre, 1 in its corners."""
     offsets: Mapping[int, float] = field(default_factory=dict)
     """Photo -> offset added to measured values, in their unit."""
+    patterns: Mapping[int, Float] = field(default_factory=dict)
+    """Photo -> (h, w) correction of measured values at nodes of the frame (`frame_pattern`)."""
     white: float = WHITES[0]
     """Value at which the response ends: gains act on the odds x / (white - x)."""
     level: float = 1.0

@@ -117,6 +117,7 @@ def map_key(
         dict(exposure.gains),
         dict(exposure.fields),
         dict(exposure.offsets),
+        dict(exposure.patterns),
         None if labels is None else labels.photo,
     )
 

@@ -16,6 +16,7 @@ from skyquilt.model.photo import Photo
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.earlier import complete, part_of, with_new
 from skyquilt.ortho.exposure import NEUTRAL, Exposure
+from skyquilt.ortho.frame_pattern import sized
 from skyquilt.ortho.ground import Ground
 from skyquilt.settings import PictureSettings
 
@@ -49,6 +50,16 @@ class DriftMethod(Protocol):
         bounds: tuple[float, float, float, float],
     ) -> dict[int, float]:
         """Offset in the values' unit by photo."""
+        ...
+
+    def patterns(
+        self,
+        views: Sequence[View],
+        thumbnails: Mapping[int, NDArray[Any]],
+        surface: Surface,
+        bounds: tuple[float, float, float, float],
+    ) -> dict[int, NDArray[np.float32]]:
+        """Correction (h, w) at nodes of the frame, common to a camera's frames, by photo."""
         ...
 
 
@@ -188,7 +199,20 @@ def drift_of(
     """
     if not balances_drift(settings, unit):
         return NEUTRAL
-    return Exposure(gains={}, fields={}, offsets=drift(views, thumbnails, surface, bounds))
+    patterns = drift.patterns(views, thumbnails, surface, bounds)
+    even = {
+        i: t + sized(patterns[i], t.shape).reshape(*t.shape[:2], *[1] * (t.ndim - 2))
+        if i in patterns
+        else t
+        for i, t in thumbnails.items()
+    }
+    offsets = drift(views, even, surface, bounds)
+    return Exposure(
+        gains={},
+        fields={},
+        offsets=offsets,
+        patterns={i: p for i, p in patterns.items() if i in offsets},
+    )
 
 
 def value_tags(unit: str, exposure: Exposure) -> dict[str, str]:
@@ -216,6 +240,7 @@ def value_figures(
     if not unit:
         return {}
     offsets = np.array(list(exposure.offsets.values()) or [0.0])
+    patterns = list(exposure.patterns.values())
     return {
         "thermal_values": {
             "unit": unit,
@@ -224,15 +249,18 @@ def value_figures(
             "offset_rms": round(float(np.sqrt((offsets**2).mean())), 4),
             "offset_largest": round(float(np.abs(offsets).max()), 4),
             "offsets": {photos[i].name: round(o, 4) for i, o in sorted(exposure.offsets.items())},
+            "pattern_rms": round(max((float(p.std()) for p in patterns), default=0.0), 4),
+            "pattern_largest": round(max((float(np.ptp(p)) for p in patterns), default=0.0), 4),
         }
     }
 
 
 def _why(unit: str, exposure: Exposure, settings: PictureSettings) -> str:
     if exposure.offsets:
+        shared = ", and what all frames show at one place of the picture"
         return (
-            "one offset per frame, from overlaps, their median 0; --raw-thermal leaves values as"
-            " recorded"
+            "one offset per frame, from overlaps, their median 0"
+            f"{shared if exposure.patterns else ''}; --raw-thermal leaves values as recorded"
         )
     if balances_drift(settings, unit):
         return "too little overlap to estimate the drift; values are as recorded, resampled only"

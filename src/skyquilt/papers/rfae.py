@@ -145,6 +145,28 @@ LOBES = (1, 3, 5, 7)
 """Initial lobes of SURF that are tried: filters of 3, 9, 15 and 21 px."""
 
 
+def off_rims(features: Features, picture: Picture) -> Features:
+    """Without features that lie on what was not measured or at its rim: outlines of two maps are
+    alike at their corners, wherever these lie.
+    """
+    band = picture.values if picture.values.ndim == 2 else picture.values.max(2)
+    measured = np.isfinite(band)
+    if picture.valid is not None:
+        measured &= picture.valid
+    if measured.all() or not len(features):
+        return features
+    room = cv2.distanceTransform(measured.astype(np.uint8), cv2.DIST_L2, 3)
+    x, y = np.rint(features.px).astype(int).T
+    here = room[np.clip(y, 0, band.shape[0] - 1), np.clip(x, 0, band.shape[1] - 1)]
+    kept = here > features.size / 2
+    return replace(
+        features,
+        px=features.px[kept],
+        size=features.size[kept],
+        descriptors=features.descriptors[kept],
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class ByFeatures:
     """SIFT, SURF or upright SURF on the images themselves."""
@@ -153,13 +175,14 @@ class ByFeatures:
     """Detector of features in an 8-bit image."""
     relate: Outliers
     """Features to a registration."""
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     def __call__(self, a: Picture, b: Picture, guess: Guess | None = None) -> Outcome:
         """The registration of b to a; a guess is not used."""
         if isinstance(refused := both_usable(a, b), RefusedRegistration):
             return refused
-        return self.relate(self.detect(a.values), self.detect(b.values), a.shape)
+        in_a, in_b = (off_rims(self.detect(p.values), p) for p in (a, b))
+        return self.relate(in_a, in_b, a.shape)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,7 +201,7 @@ class Rfae:
     """Percentile of the gradients that counts as the largest; 100 as printed."""
     of_noise: bool = True
     """Whether a threshold from the noise of each picture is tried too."""
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
 
     def __call__(self, a: Picture, b: Picture, guess: Guess | None = None) -> Outcome:
         """The registration of b to a; a guess is not used."""
@@ -192,7 +215,7 @@ class Rfae:
         tried = list(self.thresholds)
         if self.of_noise:
             tried.append(float(np.clip(noise_threshold(picture.values, self.largest), 0.02, 0.9)))
-        return [self.detect(binary_edges(magnitude, theta)) for theta in tried]
+        return [off_rims(self.detect(binary_edges(magnitude, theta)), picture) for theta in tried]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -138,5 +138,8 @@ def values_section(data: ReportInput) -> tuple[Section, ...]:
             (f"offsets of the frames, RMS, {unit}", fixed(told.get("offset_rms"), 3)),
             (f"largest offset, {unit}", fixed(told.get("offset_largest"), 3)),
         ]
+    if told.get("pattern_largest"):
+        taken = fixed(told.get("pattern_largest"), 3)
+        rows.append((f"pattern of all frames taken off, from least to most, {unit}", taken))
     table = Table(title="Measured values", head=("what", "figure"), rows=tuple(rows), numeric="tt")
     return (Section(id="values", title="Measured values", blocks=(table,)),)

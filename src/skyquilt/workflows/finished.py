@@ -163,6 +163,7 @@ def _exposure(exposure: Exposure, where: Mapping[int, int]) -> Exposure:
         gains=moved(exposure.gains),
         fields=moved(exposure.fields),
         offsets=moved(exposure.offsets),
+        patterns=moved(exposure.patterns),
     )
 
 
