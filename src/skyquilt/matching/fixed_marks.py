@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.imaging.blank import Blank, marked
 from skyquilt.model.features import Features
 
 Mask = NDArray[np.bool_]
@@ -33,6 +34,11 @@ class FixedMarks:
         column, row = np.floor(px / self.cell_px[camera]).astype(int).T
         rows, columns = mask.shape
         return np.asarray(mask[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)])
+
+    def shown(self, cameras: Sequence[str]) -> dict[int, Blank]:
+        """Where photos show marks, only of photos that do; `cameras`: that of each photo."""
+        own = {name: marked(mask, self.cell_px[name]) for name, mask in self.masks.items()}
+        return {i: own[name] for i, name in enumerate(cameras) if name in own}
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -51,6 +51,8 @@ FINER = 8
 """Cells of the raster that says where a spot is, for each cell of detail, along a side."""
 NAMED = 8
 """Photos that a note names."""
+AT_ONCE = 50_000
+"""Cells that are compared at once, to bound memory."""
 
 
 def find_blurred(
@@ -165,12 +167,16 @@ def _sharp(shown: Array, places: Array, reach: Array) -> Array:
     at, detail = places[known], shown[known]
     far = WITHIN * np.broadcast_to(reach[:, None, None], known.shape)[known]
     distance, near = nearest(at, at, min(NEIGHBOURS, len(at)))
-    same = distance <= far[:, None]
-    count = same.sum(1)
-    ordered = np.sort(np.where(same[..., None], detail[near], np.inf), axis=1)
-    rank = np.rint(SHARP_SHARE * (count - 1)).astype(np.int64)
-    told = np.take_along_axis(ordered, rank[:, None, None], 1)[:, 0]
-    out[known] = np.where(count[:, None] >= FEWEST_NEIGHBOURS, told, np.nan)
+    told = np.full(detail.shape, np.nan)
+    for low in range(0, len(at), AT_ONCE):
+        some = slice(low, low + AT_ONCE)
+        same = distance[some] <= far[some, None]
+        count = same.sum(1)
+        ordered = np.sort(np.where(same[..., None], detail[near[some]], np.inf), axis=1)
+        rank = np.rint(SHARP_SHARE * (count - 1)).astype(np.int64)
+        sharp = np.take_along_axis(ordered, rank[:, None, None], 1)[:, 0]
+        told[some] = np.where(count[:, None] >= FEWEST_NEIGHBOURS, sharp, np.nan)
+    out[known] = told
     return out
 
 

@@ -21,7 +21,6 @@ from skyquilt.engine.free_memory import give_back_growth
 from skyquilt.engine.pixel_cache import PixelCache, pixel_budget, resident_budget
 from skyquilt.engine.store import Store
 from skyquilt.engine.workers import Workers
-from skyquilt.imaging.blank import marked
 from skyquilt.model.event import Event, Note
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.poses import Alignment, MapFrame, Prior
@@ -244,15 +243,12 @@ def find_ground(
     earlier = None
     if aligned.earlier is not None and output is not None:
         earlier = aligned.earlier.map_of(aligned.photos, clock.store, output)
-    marks = aligned.links.marks
-    shown = {name: marked(mask, marks.cell_px[name]) for name, mask in marks.masks.items()}
-    keys = [p.camera_key for p in aligned.photos]
     yielding, notes = spoilt_parts(
         aligned.alignment,
         aligned.found.detail,
         aligned.found.thumbnails(sorted(aligned.alignment.poses)),
         [p.name for p in aligned.photos],
-        {i: shown[key] for i, key in enumerate(keys) if key in shown},
+        aligned.links.marks.shown([p.camera_key for p in aligned.photos]),
     )
     steps = ground.find_ground(
         aligned.alignment,
