@@ -121,6 +121,27 @@ def test_a_direction_that_positions_hardly_tell(reach, loose):
     assert loose_warnings(headless, block(ring, crs=None)) == []
 
 
+@pytest.mark.parametrize(("relief", "loose"), [(0.0, False), (1.0, False), (8.0, True)])
+def test_heights_above_take_off_tell_no_scale_over_uneven_ground(relief, loose):
+    """The drone takes off anywhere on ground whose heights scatter by so much: what is said is
+    twice the scatter of scales, weighed with those of positions.
+    """
+    rng = np.random.default_rng(0)
+    angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    ring = np.column_stack([8 * np.cos(angle), 8 * np.sin(angle), np.full(12, 50.0)])
+    found = block(ring)
+    ground = np.column_stack([rng.uniform(-30, 30, (4000, 2)), rng.normal(0, relief, 4000)])
+    found = replace(found, ties=replace(found.ties, xyz=ground))
+    said = loose_warnings(told_at(ring + rng.normal(0, 2.0, ring.shape), 2.0), found)
+    assert bool(said) == loose
+    if loose:
+        by_height, by_positions = relief / 50, 2.0 / (8 * np.sqrt(12))
+        both = 1 / np.hypot(1 / by_height, 1 / by_positions)
+        percent = float(said[0].split("small by ")[1].split()[0])
+        assert percent == pytest.approx(200 * both, rel=0.25)
+        assert "uneven by" in said[0] and "turned" not in said[0]
+
+
 def test_the_position_of_one_photo_tells_neither_direction_nor_scale():
     told = [replace(p, yaw_deg=np.nan) for p in told_at(LINES, 2.0)]
     only = [told[0], *(replace(p, map_C=np.full(3, np.nan)) for p in told[1:])]

@@ -49,7 +49,7 @@ IN_NO_KEY = {
     **dict.fromkeys(
         ("CONTRADICTED_PX", "FEWEST_POSITIONS", "CONTRADICTED_DEVIATIONS", "CONTRADICTED_SHARE")
         + ("MIRRORED", "ENLARGED", "FEWEST_ENLARGED", "ALIKE", "LOOSE_DEG", "LOOSE_SCALE")
-        + ("CHANCE",),
+        + ("CHANCE", "EVEN"),
         "conflicts are told in the report and shape nothing",
     ),
     **dict.fromkeys(

@@ -22,6 +22,10 @@ CONTRADICTED_SHARE = 0.03
 """than this share of the flight's extent, where positions contradict the pictures."""
 LOOSE_DEG, LOOSE_SCALE = 3.0, 0.05
 """Direction and scale that rest on positions alone are told where their deviations are larger."""
+EVEN = 0.02
+"""Height of the take-off point against the ground, where this is level, as a share of that of the
+photos.
+"""
 CHANCE = -1.2816
 """Few positions may fit by chance: they are taken to err by as much as would leave less than is
 seen in a tenth of cases, the quantile of the normal distribution at this place.
@@ -81,8 +85,8 @@ def position_warnings(priors: Sequence[Prior], alignment: Alignment) -> list[str
 
 def loose_warnings(priors: Sequence[Prior], alignment: Alignment) -> list[str]:
     """A sentence where positions lie so close to one another, for their errors, that they hardly
-    tell the direction of the map, and no photo tells a heading; or hardly its scale, and no height
-    above ground is known: a hover, a climb, a few photos.
+    tell the direction of the map, and no photo tells a heading; or hardly its scale, and neither do
+    heights above take-off, for want of any or over uneven ground: a hover, a climb, a few photos.
 
     Positions err as they state, or as they are seen to at most, whichever is less.
     """
@@ -109,11 +113,16 @@ def loose_warnings(priors: Sequence[Prior], alignment: Alignment) -> list[str]:
     says = []
     if turned > LOOSE_DEG and not any(np.isfinite(priors[i].yaw_deg) for i in held):
         says.append(f"be turned by {min(2 * turned, 180):.0f} degrees (no photo tells a heading)")
-    if scaled > LOOSE_SCALE and np.isnan(ground_of(alignment.frame)):
-        says.append(
-            f"be too large or small by {min(200 * scaled, 100):.0f} % (no height above take-off is"
-            " known)"
+    because = "no height above take-off is known"
+    if np.isfinite(ground_of(alignment.frame)):
+        uneven, height = _relief(alignment, held)
+        scaled = 1 / np.hypot(1 / scaled, height / max(uneven, EVEN * height))
+        because = (
+            f"the ground is uneven by {uneven:.2g} m, so heights of {height:.2g} m above take-off"
+            " hardly tell heights above it"
         )
+    if scaled > LOOSE_SCALE:
+        says.append(f"be too large or small by {min(200 * scaled, 100):.0f} % ({because})")
     if not says:
         return []
     usual = float(np.sqrt((reach[:, :2] ** 2).sum(1).mean()))
@@ -127,6 +136,18 @@ def loose_warnings(priors: Sequence[Prior], alignment: Alignment) -> list[str]:
         f"The map may {' and '.join(says)}: {why}. Give camera angles and heights, or control"
         " points."
     ]
+
+
+def _relief(alignment: Alignment, photos: Sequence[int]) -> tuple[float, float]:
+    """Deviation of the heights of tie points, and the height in m of photos above them; the place
+    of take-off may lie as high or low.
+    """
+    z = alignment.ties.xyz[:, 2]
+    if not len(z):
+        return 0.0, 1.0
+    low, middle, high = np.quantile(z, [0.16, 0.5, 0.84])
+    above = np.median([alignment.poses[i].map_C[2] for i in photos]) - middle
+    return float(high - low) / 2, max(float(above), 1.0)
 
 
 def enlargement_warnings(priors: Sequence[Prior], alignment: Alignment) -> list[str]:
