@@ -138,6 +138,24 @@ def test_mistakes_get_a_sentence_and_a_code(monkeypatch, capsys, tmp_path, words
 
 
 @pytest.mark.parametrize(
+    "words",
+    [
+        ["simulate", "{out}", "--overlap"],
+        ["simulate", "{out}", "--sidelap"],
+        ["plan", "{out}", "-o", "{out}", "--overlap"],
+        ["plan", "{out}", "-o", "{out}", "--sidelap"],
+        ["strip-test", "-o", "{out}", "--overlap"],
+    ],
+    ids=lambda words: f"{words[0]} {words[-1]}",
+)
+def test_overlaps_are_percent_and_no_shares(monkeypatch, capsys, tmp_path, words):
+    words = [w.format(out=tmp_path / "out") for w in words]
+    assert run(monkeypatch, *words, "0.75") == 2
+    assert capsys.readouterr().err == f"skyquilt: {words[-1]} is in percent: 75, not 0.75\n"
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
     ("words", "option"),
     [
         *((["inspect", "{photos}", "--max-mp", v], "--max-mp") for v in ("nan", "inf", "0", "-1")),

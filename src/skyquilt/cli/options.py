@@ -89,3 +89,14 @@ def parse_bounds(text: str | None) -> tuple[float, float, float, float] | None:
             f"--bounds is west,south,east,north, four numbers; got {text!r}"
         ) from error
     return west, south, east, north
+
+
+def in_percent(option: typer.CallbackParam, value: float | None) -> float | None:
+    """The value of an option in percent, which is no share of 1.
+
+    Raises:
+        UsageError: it lies between 0 and 1.
+    """
+    if value is not None and 0 < value < 1:
+        raise UsageError(f"{option.opts[0]} is in percent: {100 * value:g}, not {value:g}")
+    return value

@@ -8,7 +8,7 @@ from typer.core import TyperGroup
 
 from skyquilt.cli.idle import Checked
 from skyquilt.cli.interrupt import ends_at_once
-from skyquilt.cli.options import Json, Overwrite, Quiet, mode_of
+from skyquilt.cli.options import Json, Overwrite, Quiet, in_percent, mode_of
 
 if TYPE_CHECKING:
     from skyquilt.model.event import Result
@@ -49,8 +49,12 @@ def command(
     camera: Annotated[str | None, typer.Option(help=CAMERA)] = None,
     gsd: Annotated[float | None, typer.Option(help="Ground size of a pixel in cm.")] = None,
     height: Annotated[float | None, typer.Option(help="Height above the ground in m.")] = None,
-    overlap: Annotated[float, typer.Option(help="Overlap along the lines, percent.")] = 80,
-    sidelap: Annotated[float, typer.Option(help="Overlap between the lines, percent.")] = 70,
+    overlap: Annotated[
+        float, typer.Option(help="Overlap along the lines, percent.", callback=in_percent)
+    ] = 80,
+    sidelap: Annotated[
+        float, typer.Option(help="Overlap between the lines, percent.", callback=in_percent)
+    ] = 70,
     views: Annotated[
         int | None,
         typer.Option(help="Photos that see each cell.", show_default="as the overlaps give"),

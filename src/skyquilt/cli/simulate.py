@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from skyquilt.cli.options import in_percent
 from skyquilt.errors import UsageError
 from skyquilt.outside import whole
 
@@ -30,8 +31,12 @@ def command(
         PresetName, typer.Option(help="flight to start from; the options change it")
     ] = "default",
     photos: Annotated[int | None, typer.Option(help="photos planned")] = None,
-    overlap: Annotated[float | None, typer.Option(help="forward overlap, percent")] = None,
-    sidelap: Annotated[float | None, typer.Option(help="side overlap, percent")] = None,
+    overlap: Annotated[
+        float | None, typer.Option(help="forward overlap, percent", callback=in_percent)
+    ] = None,
+    sidelap: Annotated[
+        float | None, typer.Option(help="side overlap, percent", callback=in_percent)
+    ] = None,
     height: Annotated[float | None, typer.Option(help="above take-off, m")] = None,
     speed: Annotated[float | None, typer.Option(help="over ground, m/s")] = None,
     stops: Annotated[bool, typer.Option("--stops", help="the drone stops for each photo")] = False,

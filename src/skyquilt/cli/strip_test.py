@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from skyquilt.cli.interrupt import ends_at_once
-from skyquilt.cli.options import Json, Overwrite, Quiet, mode_of
+from skyquilt.cli.options import Json, Overwrite, Quiet, in_percent, mode_of
 
 if TYPE_CHECKING:
     from skyquilt.model.event import Result
@@ -18,7 +18,9 @@ def command(
         Path, typer.Option("--output", "-o", help="Folder for strip.json and report.html.")
     ],
     photos: Annotated[int, typer.Option(help="Number of photos along the strip.")] = 21,
-    overlap: Annotated[float, typer.Option(help="Overlap from photo to photo, percent.")] = 70,
+    overlap: Annotated[
+        float, typer.Option(help="Overlap from photo to photo, percent.", callback=in_percent)
+    ] = 70,
     height: Annotated[float, typer.Option(help="Flight height above the boards, m.")] = 30,
     relief: Annotated[
         float, typer.Option(help="Height of the highest object on the boards, m.")
