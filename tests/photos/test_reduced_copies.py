@@ -55,6 +55,41 @@ def test_other_photos_stay(other):
     assert left_out(other) == set()
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        "DJI_0001_edited.JPG",
+        "edits/DJI_0001-Bearbeitet.jpg",
+        "DJI_0001 (1).jpg",
+        "DJI_0001 copy.jpg",
+    ]
+    + ["DJI_0001-Edit-2.tif", "DJI_0001_HDR.jpg", "dji_0001 - Kopie.JPG", "DJI_0001-modifié.jpg"],
+)
+def test_an_edited_copy_beside_its_original(name):
+    assert left_out(taken(name, 1)) == {name}
+    assert left_out(taken(name, 1, position=None)) == {name}
+    kept, out = without_reduced([taken(name, 1)])  # where that is all there is
+    assert len(kept) == 1 and out == ()
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        taken("DJI_0001_edited.JPG", 9),  # of another moment
+        taken("DJI_0001_edited.JPG", 1, time=None),
+        taken("DJI_0001_edited.JPG", 1, width=4000, height=4000),  # cropped: a view of its own
+        taken("DJI_0001_T.JPG", 1),
+        taken("DJI_0001_2.JPG", 1),  # a burst, a bracket, another camera of a rig
+        taken("DJI_0001_edited.JPG", 1, band="thermal"),
+        taken("right/DJI_0001.JPG", 1),
+        taken("edited.JPG", 1),
+    ],
+    ids=str,
+)
+def test_what_is_no_edited_copy(other):
+    assert left_out(other) == set()
+
+
 def test_without_metadata_anywhere_equal_names_tell_nothing():
     bare = [replace(p, time=None, position=None) for p in FULL]
     small = replace(bare[0], name="second/DJI_0000.JPG", width=2000, height=1500)

@@ -6,8 +6,9 @@ each band: a map of all of them would be a patchwork of bands, so it shows one.
 """
 
 import os
+import re
 from collections import Counter, defaultdict
-from collections.abc import Hashable, Iterable, Iterator, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
@@ -20,6 +21,12 @@ SMALLER = 0.8
 """A copy has less than this share of the photo's width; ..."""
 SAME = 0.03
 """... the same shape and the same angle of view, within this share."""
+EDITED = re.compile(
+    r"(?P<name>.+?)[ _-]*(\(\d+\)|[ _-](edit(ed|ad[oa])?|cop(y|ie|ia)|kopi[ea]|bearbeitet|bewerkt"
+    r"|modifi(e|é|cat[oa])|retouch(e|ed|é)?|enhanced|adjusted|corrected|(auto)?colou?r|hdr)"
+    r"[ _-]?\d*)"
+)
+"""Stems of files that programs save beside the photo that they changed."""
 IS_MAP = "it is a map (a GeoTIFF, placed on the ground), not a photo"
 """The reason recorded for a map among photos."""
 PREFERRED = ("green", "red")
@@ -79,26 +86,49 @@ def without_maps(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[Reje
 
 
 def without_reduced(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[RejectedPhoto, ...]]:
-    """The photos without smaller copies of others, and these with their reason.
+    """The photos without smaller and without edited copies of others, and these with their reason.
 
-    A copy states the same place and time and has the same angle of view or name; or it has the
-    same name and no metadata.
+    A smaller copy states the same place and time and has the same angle of view or name; or it has
+    the same name and no metadata. An edited one states the same place and time, and its name says
+    so.
     """
     alike: dict[Hashable, list[Photo]] = defaultdict(list)
     for photo in photos:
         for key in _keys(photo):
             alike[key].append(photo)
     copy_of: dict[str, str] = {}
+    edits = {p.name: o.name for p in photos if (o := _edited_from(p, alike)) is not None}
     for group in alike.values():
         largest = max(group, key=lambda p: (p.width, p.name))
         for photo in group:
             if _is_reduced(photo, largest):
                 copy_of[photo.name] = largest.name
-    kept = tuple(p for p in photos if p.name not in copy_of)
-    return kept, tuple(
-        RejectedPhoto(name=name, reason=f"it is a smaller copy of {original}")
-        for name, original in copy_of.items()
-    )
+    reasons = {name: f"it is an edited copy of {original}" for name, original in edits.items()}
+    reasons |= {name: f"it is a smaller copy of {original}" for name, original in copy_of.items()}
+    kept = tuple(p for p in photos if p.name not in reasons)
+    return kept, tuple(RejectedPhoto(name=name, reason=why) for name, why in reasons.items())
+
+
+def _edited_from(photo: Photo, alike: Mapping[Hashable, Sequence[Photo]]) -> Photo | None:
+    """The photo that another program changed and saved under a name that says so; None for others.
+    `alike`: photos by what they share with copies.
+    """
+    told = EDITED.fullmatch(_stem(photo))
+    if told is None:
+        return None
+    for original in alike.get(told["name"], ()):
+        ratio = photo.width / original.width
+        same = photo.band == original.band and photo.camera_key == original.camera_key
+        same &= photo.time is not None and photo.time == original.time
+        same &= _place(photo) in (None, _place(original))
+        if same and abs(photo.height / original.height / ratio - 1) < SAME:
+            return original
+    return None
+
+
+def _place(photo: Photo) -> tuple[float, float] | None:
+    place = photo.position
+    return None if place is None else (place.latitude_deg, place.longitude_deg)
 
 
 def _keys(photo: Photo) -> Iterator[Hashable]:
