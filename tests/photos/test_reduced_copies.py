@@ -68,6 +68,8 @@ def test_other_photos_stay(other):
 def test_an_edited_copy_beside_its_original(name):
     assert left_out(taken(name, 1)) == {name}
     assert left_out(taken(name, 1, position=None)) == {name}
+    rounded = replace(FULL[1].position, latitude_deg=FULL[1].position.latitude_deg + 3e-9)
+    assert left_out(taken(name, 1, position=rounded)) == {name}  # programs drop the XMP
     kept, out = without_reduced([taken(name, 1)])  # where that is all there is
     assert len(kept) == 1 and out == ()
 

@@ -27,6 +27,8 @@ EDITED = re.compile(
     r"[ _-]?\d*)"
 )
 """Stems of files that programs save beside the photo that they changed."""
+ROUNDED_DEG = 1e-5
+"""Latitudes and longitudes of a photo and its copy differ by less than this."""
 IS_MAP = "it is a map (a GeoTIFF, placed on the ground), not a photo"
 """The reason recorded for a map among photos."""
 PREFERRED = ("green", "red")
@@ -120,22 +122,29 @@ def _edited_from(photo: Photo, alike: Mapping[Hashable, Sequence[Photo]]) -> Pho
         ratio = photo.width / original.width
         same = photo.band == original.band and photo.camera_key == original.camera_key
         same &= photo.time is not None and photo.time == original.time
-        same &= _place(photo) in (None, _place(original))
+        same &= _at_one_place(photo, original)
         if same and abs(photo.height / original.height / ratio - 1) < SAME:
             return original
     return None
 
 
-def _place(photo: Photo) -> tuple[float, float] | None:
-    place = photo.position
-    return None if place is None else (place.latitude_deg, place.longitude_deg)
+def _at_one_place(photo: Photo, original: Photo) -> bool:
+    """Whether a photo states the place of another or none; programs drop the more exact one of two
+    that a file has.
+    """
+    a, b = photo.position, original.position
+    if a is None or b is None:
+        return a is None
+    apart = abs(a.latitude_deg - b.latitude_deg), abs(a.longitude_deg - b.longitude_deg)
+    return max(apart) < ROUNDED_DEG
 
 
 def _keys(photo: Photo) -> Iterator[Hashable]:
     """What a photo shares with its copies."""
     place = photo.position
     if photo.time is not None and place is not None:
-        yield photo.time, place.latitude_deg, place.longitude_deg, photo.band, photo.band_name
+        near = round(place.latitude_deg, 5), round(place.longitude_deg, 5)
+        yield photo.time, near, photo.band, photo.band_name
     yield _stem(photo)
 
 
@@ -151,10 +160,9 @@ def _is_reduced(photo: Photo, original: Photo) -> bool:
     if photo.time is None and photo.position is None:
         told = original.time is not None or original.position is not None
         return told and _stem(photo) == _stem(original)
-    a, b = photo.position, original.position
-    if a is None or b is None or photo.time != original.time or photo.band != original.band:
+    if photo.time != original.time or photo.band != original.band:
         return False
-    if (a.latitude_deg, a.longitude_deg) != (b.latitude_deg, b.longitude_deg):
+    if photo.position is None or not _at_one_place(photo, original):
         return False
     same_view = abs(photo.focal.px / original.focal.px / ratio - 1) < SAME
     return same_view or _stem(photo) == _stem(original)
