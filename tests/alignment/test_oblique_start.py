@@ -7,7 +7,13 @@ import pytest
 
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.oblique_guess import LOWERED, guessed_priors, lowered
-from skyquilt.alignment.oblique_start import reported_start, slanting, tilt_warnings, turned_priors
+from skyquilt.alignment.oblique_start import (
+    reported_start,
+    slanting,
+    tilt_warnings,
+    turned_priors,
+    within_noise,
+)
 from skyquilt.alignment.triangulate import regular
 from skyquilt.geometry.camera import project
 from skyquilt.geometry.frames import cam_R_map_from_angles
@@ -172,6 +178,20 @@ def test_an_orbit_begun_as_if_it_looked_down_is_begun_again(monkeypatch):
     assert 3 <= len(begun) <= 6
     assert np.median(away) < 2 < 5 < begun_with  # receivers err by 1.5 m
     assert np.median(turned) < 2.5
+
+
+def test_rays_that_do_not_meet_tell_no_ground_but_from_one_place():
+    """The height above take-off counts for photos that cannot tell the ground, not for those whose
+    headings are false.
+    """
+    apart = Slanting(orbit(20, 50), seed=180)
+    away = [replace(p, yaw_deg=p.yaw_deg + 180) for p in apart.priors]
+    told = (apart.photos, away, apart.features, apart.links)
+    assert reported_start(*told, 0.0) is None
+    assert not within_noise(apart.priors) and not within_noise(apart.priors[:3])
+    middle = np.mean([p.map_C for p in apart.priors], axis=0)
+    crowd = [replace(p, map_C=middle + 0.01 * (p.map_C - middle)) for p in apart.priors]
+    assert within_noise(crowd)
 
 
 @pytest.mark.parametrize("turn", [90, pytest.param(180, marks=pytest.mark.slow)])

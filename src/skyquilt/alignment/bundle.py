@@ -341,7 +341,9 @@ def _outcome(
         ties=ties,
         rejected=weak,
         control=residuals_of_control(control, frame, setup, problem, state, full),
-        accuracy=accuracy(setup, problem, state, full) if predicted and full else None,
+        accuracy=accuracy(setup, problem, state, full)
+        if predicted and full and len(ties.px)
+        else None,
         notes=undetermined(setup, problem, state, full) + misfits(setup, problem, state),
         loo_rms_m=leave_one_out(problem, state, full) if setup.georeferenced else None,
     )

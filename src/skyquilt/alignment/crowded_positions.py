@@ -8,22 +8,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyquilt.alignment.determined import STATED_DEG
 from skyquilt.alignment.inputs import AlignmentInputs
-from skyquilt.alignment.oblique_start import map_rays
+from skyquilt.alignment.oblique_start import map_rays, reach_of, within_noise
 from skyquilt.alignment.start import NOMINAL_HEIGHT_M, find_start, ground_of
 from skyquilt.model.features import Link
 from skyquilt.model.poses import Alignment, MapFrame, Prior
 
-FEWEST = 4
-"""Photos with positions that are needed to judge them."""
-NOISE = 5.0
-"""Positions crowd if half of them lie within so many of their deviations of their middle, ..."""
 FURTHER = 4.0
-"""... and the pictures show photos so many times further apart, seen from the height that they
-report, ...
+"""Positions that lie within their errors of one another crowd if the pictures show photos so many
+times further apart, seen from the height that they report, ...
 """
 LEAST_HEIGHT_M = 8.0
 """... or from this height, where they report none: with positions that crowd, the map would show
@@ -51,8 +46,8 @@ def without_crowded(inputs: AlignmentInputs) -> tuple[AlignmentInputs, tuple[str
     none do. Heights stay: they tell the map's scale.
     """
     told = inputs.priors
-    reach = _reach(np.array([p.map_C[:2] for p in told]).reshape(-1, 2))
-    if not inputs.links or inputs.frame.crs is None or not _within_noise(told, reach):
+    reach = reach_of(np.array([p.map_C[:2] for p in told]).reshape(-1, 2))
+    if not inputs.links or inputs.frame.crs is None or not within_noise(told):
         return inputs, ()
     if _only_turned(inputs):
         return inputs, ()
@@ -60,7 +55,7 @@ def without_crowded(inputs: AlignmentInputs) -> tuple[AlignmentInputs, tuple[str
     start = find_start(inputs.photos, bare, inputs.features, inputs.links, ground)
     scale = 1.0 if start.metric else LEAST_HEIGHT_M / NOMINAL_HEIGHT_M
     block = [start.placed[m][1] for m in max(start.blocks, key=len, default=())]
-    shown = scale * _reach(np.array([(t.real, t.imag) for t in block]).reshape(-1, 2))
+    shown = scale * reach_of(np.array([(t.real, t.imag) for t in block]).reshape(-1, 2))
     if not shown > FURTHER * reach:
         return inputs, ()
     control = sum(not point.check for point in inputs.control) >= FEWEST_CONTROL
@@ -94,15 +89,9 @@ def believed(found: Alignment, frame: MapFrame, priors: Sequence[Prior]) -> Sequ
     return without_places(priors) if frame.crs and not found.frame.crs else priors
 
 
-def _within_noise(priors: Sequence[Prior], reach: float) -> bool:
-    sigma = [p.sigma_C[0] for p in priors if np.isfinite(p.map_C[0])]
-    return len(sigma) >= FEWEST and reach < NOISE * float(np.median(sigma))
-
-
 def one_place_notes(inputs: AlignmentInputs) -> tuple[str, ...]:
     """A sentence on the photos of a panorama or a hover."""
-    reach = _reach(np.array([p.map_C[:2] for p in inputs.priors]).reshape(-1, 2))
-    if inputs.frame.crs is None or not _within_noise(inputs.priors, reach):
+    if inputs.frame.crs is None or not within_noise(inputs.priors):
         return ()
     return (ONE_PLACE,) if _only_turned(inputs) else ()
 
@@ -137,11 +126,3 @@ def _rays_apart_deg(inputs: AlignmentInputs, link: Link) -> float:
     ]
     sine = np.linalg.norm(np.cross(rays[0], rays[1]), axis=1)
     return float(np.degrees(np.arcsin(np.median(np.minimum(sine, 1)))))
-
-
-def _reach(xy: NDArray[np.float64]) -> float:
-    """Median distance of places (n, 2) from their middle; NaN without any."""
-    xy = xy[np.isfinite(xy).all(1)]
-    if not len(xy):
-        return np.nan
-    return float(np.median(np.linalg.norm(xy - np.median(xy, axis=0), axis=1)))

@@ -30,6 +30,10 @@ NEARER = 0.95
 """Photos come nearer to their positions where their distance falls by this factor."""
 LOST = 0.8
 """An adjustment that holds less than this share of another's photos lost them."""
+FEWEST_CROWDED = 4
+"""Photos with positions that are needed to judge whether these crowd in one place: ..."""
+CROWDED = 5.0
+"""... half of them lie within so many of their deviations of their middle."""
 FEWEST_MET = 50
 """Fewest such pairs of rays that tell the height of the ground."""
 
@@ -122,7 +126,9 @@ def reported_start(
     meetings = _meetings(photos, priors, features, links)
     if not members:
         return None
-    seen = float(np.median(meetings)) if len(meetings) >= FEWEST_MET else ground_m
+    seen = float(np.median(meetings)) if len(meetings) >= FEWEST_MET else np.nan
+    if np.isnan(seen) and within_noise([priors[i] for i in members]):
+        seen = ground_m
     if np.isnan(seen):
         return None
     lowest = min(priors[i].map_C[2] for i in members)
@@ -141,6 +147,23 @@ def reported_start(
         metric=True,
         in_space=True,
     )
+
+
+def within_noise(priors: Sequence[Prior]) -> bool:
+    """Whether positions lie as close to one another as their errors alone would have them."""
+    known = [p for p in priors if np.isfinite(p.map_C[0])]
+    if len(known) < FEWEST_CROWDED:
+        return False
+    reach = reach_of(np.array([p.map_C[:2] for p in known]))
+    return reach < CROWDED * float(np.median([p.sigma_C[0] for p in known]))
+
+
+def reach_of(xy: Array) -> float:
+    """Median distance of places (n, 2) from their middle; NaN without any."""
+    xy = xy[np.isfinite(xy).all(1)]
+    if not len(xy):
+        return np.nan
+    return float(np.median(np.linalg.norm(xy - np.median(xy, axis=0), axis=1)))
 
 
 def _meetings(

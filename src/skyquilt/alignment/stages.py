@@ -151,6 +151,8 @@ def weighed(
     other, with turns of the cameras, or with cameras that stood still, whichever explains the
     photos better. Of large surveys, some photos tell, also whether turns are worth estimating.
     """
+    if not len(problem.px):  # begun so wrongly that no ray meets another
+        return problem, state
     problem = replace(problem, sigma_px=problem.sigma_px * problem.relative, relative=1.0)
     sizes, near = setup.size[setup.members], near or NearFactor()
     rolls, many = _rolls(problem, state), _is_large(problem)

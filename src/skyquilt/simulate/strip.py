@@ -75,7 +75,7 @@ class StripSettings:
                 f"relief must be 0 to a third of the height, not {self.relief:g} m",
             ),
             (0 <= self.tilt <= 8, f"tilt must be 0 to 8 degrees, not {self.tilt:g}"),
-            (0 <= self.noise <= 100, f"noise must be 0 to 100 px, not {self.noise:g} px"),
+            (0 <= self.noise <= 1000, f"noise must be 0 to 1000 px, not {self.noise:g} px"),
         ]
         for holds, sentence in rules:
             if not holds:
