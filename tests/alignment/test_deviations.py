@@ -91,3 +91,16 @@ def test_blunt_observations_of_what_stands_high_do_not_decide_a_focal_length():
     assert np.sqrt((error**2).mean()) < 0.7 * np.sqrt((other**2).mean())
     assert 0.5 < np.sqrt(((error / sigma) ** 2).mean()) < 1.1
     assert np.sqrt(((other / stated) ** 2).mean()) > 1.3
+
+
+def test_without_observations_nothing_is_weighed():
+    """A start so wrong that no ray meets another loses all of them."""
+    block = make_block()
+    none = np.zeros(0, np.int64)
+    empty = replace(
+        block.problem, point=none, photo=none, px=np.zeros((0, 2)), sigma_px=np.zeros(0)
+    )
+    photos = len(block.truth.C)
+    setup = SimpleNamespace(size=np.tile([WIDTH, HEIGHT], (photos, 1)), members=np.arange(photos))
+    problem, state = weighed(empty, block.truth, setup)
+    assert problem is empty and state is block.truth
