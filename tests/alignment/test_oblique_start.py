@@ -225,6 +225,7 @@ def test_what_looks_at_the_horizon_is_not_lowered():
     assert lowered(found, flown.priors) is flown.priors
 
 
+@pytest.mark.slow
 def test_photos_without_angles_are_guessed_to_look_at_the_middle():
     flown = Slanting(orbit(24, 40), seed=3)
     level = [replace(p, yaw_deg=np.nan) for p in untold_tilts(flown)]

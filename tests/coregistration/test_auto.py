@@ -59,6 +59,7 @@ def test_few_pixels_of_the_whole_cost_no_search(auto, monkeypatch):
     assert found and error(found.b_H_a, truth) < 0.3
 
 
+@pytest.mark.slow
 def test_a_picture_of_a_part_of_the_other_is_found_in_it(auto):
     truth = turned(1.0, 200.0, SHAPE, (160, 200), (-25.0, 10.0))  # a sixth of a's area
     a, b = pair(truth, shape_b=(160, 200), seed=4)

@@ -77,6 +77,7 @@ def test_mixed_cameras_are_refused(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_too_few_views_are_refused_with_the_reasons(tmp_path):
     for k, shift in enumerate(((0, 0, 1.6), (0.1, 0, 1.7))):
         write(tmp_path / "in", f"whole{k}.tif", frame(frontal(shift=shift), seed=k))

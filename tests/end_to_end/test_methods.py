@@ -149,6 +149,7 @@ def test_strangers_begin_a_piece_of_their_own(mosaic, photos, lines):
     assert "ZZ_0.jpg does not match SIM_0009.jpg, the photo before it" in told.notes
 
 
+@pytest.mark.slow
 def test_what_methods_need_is_said_when_it_is_missing(mosaic, photos):
     for path in named(photos):
         relabel(path, drop=["position"])

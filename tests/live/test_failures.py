@@ -307,6 +307,7 @@ def run_until(live, inbox, done, seconds=60):
     return notes
 
 
+@pytest.mark.slow
 def test_an_inbox_that_goes_away_is_told_once_and_when_it_is_back(tmp_path, monkeypatch):
     inbox = tmp_path / "in"
     inbox.mkdir()
@@ -330,6 +331,7 @@ def test_an_inbox_that_goes_away_is_told_once_and_when_it_is_back(tmp_path, monk
     ]
 
 
+@pytest.mark.slow
 def test_a_disk_that_stays_full_is_told_once(tmp_path, monkeypatch):
     inbox = tmp_path / "in"
     inbox.mkdir()

@@ -336,6 +336,7 @@ def test_half_sent_headers_keep_nobody_out(run, monkeypatch):
         assert ended == 120
 
 
+@pytest.mark.slow
 def test_a_client_that_takes_no_answer_is_disconnected(run, monkeypatch):
     monkeypatch.setattr(connections, "SENDING_S", 1.0)
     with ServerThread(survey=open_survey(run), guard=Guard(token="looking-only"), folder=run) as s:
@@ -354,6 +355,7 @@ def test_a_client_that_takes_no_answer_is_disconnected(run, monkeypatch):
         one.close()
 
 
+@pytest.mark.slow
 def test_announced_uploads_expire_and_are_counted_per_client(tmp_path):
     guard = Guard(most_uploads=6, most_uploads_each=3, upload_idle_s=1.0, upload_empty_s=2.0)
     tus = {"Tus-Resumable": "1.0.0", "Upload-Length": "1000"}

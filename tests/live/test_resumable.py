@@ -137,6 +137,7 @@ def test_an_upload_goes_on_after_a_lost_connection(site, client, flight):
     assert answer.headers.get("photo-state") == "received", (answer.status_code, answer.text)
 
 
+@pytest.mark.slow
 def test_one_writer_at_a_time_and_a_silent_one_gives_up(flight, tmp_path):
     with served(tmp_path / "out", QUICK, guard=Guard(upload_stall_s=3.0)) as site:
         client, data = Client(site.web), flight.photos[1].read_bytes()

@@ -194,6 +194,7 @@ def test_half_a_turn_to_the_next_line_is_a_half_circle_or_a_bulb():
     assert bulb.length == pytest.approx(np.pi + 4 * outer)
 
 
+@pytest.mark.slow
 def test_a_fixed_wing_turns_within_its_radius_and_keeps_clear():
     radius = 25.0
     closed = KeepOut(shape=box(-60, 40, -45, 80))
