@@ -12,7 +12,7 @@ from skyquilt.alignment.outcome import ASPECT, NO_FIT
 from skyquilt.alignment.problem import READOUT
 from skyquilt.alignment.setup import priors_by_camera, set_up
 from skyquilt.alignment.start import find_start
-from skyquilt.alignment.unfit_cameras import loosened, unfit_cameras
+from skyquilt.alignment.unfit_cameras import loosened, unfit_cameras, unfit_notes
 from skyquilt.model.camera import Camera
 from skyquilt.model.photo import Shutter
 from tests.alignment.surveys import FOCAL, HEIGHT, WIDTH, alignment, photo
@@ -65,6 +65,20 @@ def test_photos_that_fit_no_camera_contradict_what_is_assumed():
     photos = [photo(f"{i}.jpg", shutter=UNKNOWN) for i in range(8)]
     assert judged(found_as(notes=(note,)), photos) == {"cam"}
     assert judged(found_as(notes=(note.replace("cam", "cam 2", 1),)), photos) == set()
+
+
+@pytest.mark.parametrize(
+    ("readout_ms", "said"),
+    [
+        (60.0, "within 60 ms (0:"),
+        (-30.0, "within 30 ms, the last row first (0:"),
+        (-0.2, "within 0 ms (0:"),
+    ],
+)
+def test_a_readout_from_below_is_told_as_such(readout_ms, said):
+    found = found_as(readout_s=readout_ms / 1000, aspect=1.03)
+    (note,) = unfit_notes(found, {"cam"})
+    assert said in note and "the ratio 1.030 (1:" in note
 
 
 def test_only_what_is_assumed_of_these_cameras_is_loosened(setup_of):

@@ -76,11 +76,12 @@ def unfit_notes(found: Alignment, cameras: Collection[str]) -> tuple[str, ...]:
     notes = []
     for key in sorted(cameras):
         ms, ratio = 1000 * found.cameras[key].readout_s, found.cameras[key].aspect
+        order = ", the last row first" if ms < -0.5 else ""
         notes.append(
             f"The photos of {key} do not fit the camera that they were taken for. The pictures tell"
-            f" that its rows are exposed within {ms:.0f} ms (0: all at once), and that its focal"
-            f" lengths along columns and rows have the ratio {ratio:.3f} (1: nobody resized the"
-            " pictures along one side). State them by --shutter-readout and --cameras if you know"
-            " better."
+            f" that its rows are exposed within {abs(ms):.0f} ms{order} (0: all at once), and that"
+            f" its focal lengths along columns and rows have the ratio {ratio:.3f} (1: nobody"
+            " resized the pictures along one side). State them by --shutter-readout and --cameras"
+            " if you know better."
         )
     return tuple(notes)
