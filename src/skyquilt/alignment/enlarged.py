@@ -91,12 +91,16 @@ def as_enlarged(photos: Sequence[Photo], factors: Mapping[int, float]) -> list[P
     return out
 
 
+def misfit_px(found: Alignment) -> float:
+    """Mean distance in px between where photos show tie points and where they project."""
+    return float(np.linalg.norm(found.ties.residual_px, axis=1).mean())
+
+
 def fits_better(other: Alignment, found: Alignment) -> bool:
     """Whether an alignment fits the pictures clearly better than another, with no fewer photos."""
-    misfits = [float(np.linalg.norm(a.ties.residual_px, axis=1).mean()) for a in (other, found)]
     whole = len(other.held) >= len(found.held)
     whole &= len(other.ties.photo) >= len(found.ties.photo)
-    return whole and misfits[0] < BETTER * misfits[1]
+    return whole and misfit_px(other) < BETTER * misfit_px(found)
 
 
 def enlarged_note(factors: Mapping[int, float], cameras: Sequence[str]) -> str:

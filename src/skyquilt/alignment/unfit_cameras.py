@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.enlarged import misfit_px
 from skyquilt.alignment.outcome import ASPECT, NO_FIT
 from skyquilt.alignment.problem import READOUT
 from skyquilt.alignment.setup import SIGMA_ASPECT, Setup
@@ -67,8 +68,8 @@ def fits_as_well(other: Alignment, found: Alignment) -> bool:
     """Whether an alignment holds as many photos as another, and fits the pictures about as well or
     better.
     """
-    misfits = [float(np.linalg.norm(a.ties.residual_px, axis=1).mean()) for a in (other, found)]
-    return len(other.held) >= len(found.held) and misfits[0] <= WORSE * misfits[1]
+    as_well = misfit_px(other) <= WORSE * misfit_px(found)
+    return as_well and len(other.held) >= len(found.held)
 
 
 def unfit_notes(found: Alignment, cameras: Collection[str]) -> tuple[str, ...]:

@@ -18,6 +18,7 @@ from skyquilt.imaging.nodes import View
 from skyquilt.imaging.views import on_ground
 from skyquilt.model.poses import Alignment
 from skyquilt.ortho.tie_surface import level
+from skyquilt.photos.side_rows import sentence_of
 
 Array = NDArray[np.float64]
 BLURRED = 1.0
@@ -49,8 +50,6 @@ ground differ, by up to 0.9.
 """
 FINER = 8
 """Cells of the raster that says where a spot is, for each cell of detail, along a side."""
-NAMED = 8
-"""Photos that a note names."""
 AT_ONCE = 50_000
 """Cells that are compared at once, to bound memory."""
 
@@ -104,16 +103,10 @@ def find_blurred(
     return found, tuple(notes)
 
 
-def some_names(names: Sequence[str]) -> str:
-    """Names for a note, not more than a few."""
-    more = len(names) - NAMED
-    return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
-
-
 def _note(names: Sequence[str]) -> str:
     some = f"{len(names)} photos are" if len(names) > 1 else "One photo is"
     return (
-        f"{some} blurred against others of the same ground ({some_names(names)}): gusts, a long"
+        f"{some} blurred against others of the same ground ({sentence_of(names)}): gusts, a long"
         " exposure or a drone that flew too fast for it. They are drawn only where no other photo"
         " shows the ground."
     )

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from skyquilt.imaging.blank import Blank, around, joined
 from skyquilt.model.poses import Alignment
-from skyquilt.ortho.sharpness import find_blurred, some_names
+from skyquilt.ortho.sharpness import find_blurred
+from skyquilt.photos.side_rows import sentence_of
 
 WHITE = 250
 """Level of 255 from which a band of a reduced picture shows nothing more."""
@@ -35,7 +36,7 @@ def spoilt_parts(
         if part := _white(alignment, i, thumbnails[i]):
             white[i] = part
     if white:
-        listed = some_names([names[i] for i in white])
+        listed = sentence_of([names[i] for i in white])
         some = f"{len(white)} photos are" if len(white) > 1 else "One photo is"
         notes += (
             f"{some} overexposed in part ({listed}): what is white there is drawn only where no"

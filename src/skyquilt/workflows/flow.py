@@ -243,28 +243,28 @@ def find_ground(
     earlier = None
     if aligned.earlier is not None and output is not None:
         earlier = aligned.earlier.map_of(aligned.photos, clock.store, output)
-    yielding, notes = spoilt_parts(
-        aligned.alignment,
-        aligned.found.detail,
-        aligned.found.thumbnails(sorted(aligned.alignment.poses)),
-        [p.name for p in aligned.photos],
-        aligned.links.marks.shown([p.camera_key for p in aligned.photos]),
-    )
-    steps = ground.find_ground(
-        aligned.alignment,
-        aligned.grey,
-        methods.surface,
-        methods.sweep,
-        settings.picture,
-        clock.store,
-        clock.workers,
-        pictures=picture_recipe(),
-        earlier=earlier,
-        see_through=[i for i, p in enumerate(aligned.photos) if p.alpha],
-        marks=yielding,
-    )
-    found = yield from clock.stage("surface", steps)
-    return replace(found, notes=(*found.notes, *notes))
+
+    def steps() -> Steps[Ground]:
+        alignment, looks = aligned.alignment, aligned.found
+        fixed = aligned.links.marks.shown([p.camera_key for p in looks.photos])
+        small, names = looks.thumbnails(sorted(alignment.poses)), [p.name for p in looks.photos]
+        marks, notes = spoilt_parts(alignment, looks.detail, small, names, fixed)
+        found = yield from ground.find_ground(
+            alignment,
+            aligned.grey,
+            methods.surface,
+            methods.sweep,
+            settings.picture,
+            clock.store,
+            clock.workers,
+            pictures=picture_recipe(),
+            earlier=earlier,
+            see_through=[i for i, p in enumerate(aligned.photos) if p.alpha],
+            marks=marks,
+        )
+        return replace(found, notes=(*found.notes, *notes))
+
+    return (yield from clock.stage("surface", steps()))
 
 
 def draw_map(
