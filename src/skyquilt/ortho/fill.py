@@ -1,6 +1,6 @@
 """Heights where none were measured: gaps are filled, and the rim goes over to a plane."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import cv2
@@ -27,6 +27,10 @@ LEVEL = 5
 """Side in cells of the window in which heights are smoothed."""
 STIFF = 0.002
 """Weight of a prior of zero for the slope of a plane."""
+FEW = 0.05
+"""Weight of a cell with other heights, in place of one that is supported."""
+Others = Callable[[slice], tuple[Float, Mask]]
+"""Gives other heights (n, w) for rows of a raster, and where they are worth something."""
 
 
 def filled(z: Float, known: Mask) -> Float:
@@ -59,48 +63,63 @@ def _mean(total: Float, weight: Float) -> Float:
     return np.asarray(total / np.maximum(weight, 1e-6), np.float32)
 
 
-def settled(z: Float, support: Mask) -> Float:
+def settled(z: Float, support: Mask, others: Others | None = None) -> Float:
     """Heights (h, w) that beyond their support are those of the local plane: fitted to the
     supported heights around, its slope drawn towards zero where few determine it. So what a rim
-    shows is a photo on a plane, not on heights continued from a few points. The array itself is
-    changed, and returned.
+    shows is a photo on a plane, not on heights continued from a few points. Far from the support
+    `others` take the plane's place where they are worth something, and planes are fitted to them
+    too. The array itself is changed, and returned.
     """
     if support.all() or not support.any():
         return z
-    plane = _planes(z, support)
+    plane, far = _planes(z, support, others)
     down, across = (_between(n, small) for n, small in zip(z.shape, plane.shape, strict=True))
     for row in range(0, len(z), STRIP):
         rows = slice(row, row + STRIP)
         beyond = ~support[rows]
-        if beyond.any():
-            z[rows][beyond] = (down[rows] @ plane @ across.T)[beyond]
+        if not beyond.any():
+            continue
+        here = down[rows] @ plane @ across.T
+        if others is not None:
+            heights, worth = others(rows)
+            here += worth * (down[rows] @ far @ across.T) * (heights - here)
+        z[rows][beyond] = here[beyond]
     return z
 
 
-def _planes(z: Float, support: Mask) -> Float:
-    """Heights of planes fitted to the supported heights around each cell of a raster of at most
-    COARSE cells a side, by weighted least squares.
+def _planes(z: Float, support: Mask, others: Others | None) -> tuple[Float, Float]:
+    """Heights of planes fitted to the heights around each cell of a raster of at most COARSE cells
+    a side, by weighted least squares, and the share (0 to 1) of other heights in these.
     """
     h, w = z.shape
     factor = max(1.0, max(h, w) / COARSE)
     small = (max(2, round(h / factor)), max(2, round(w / factor)))
     down, across = _shares(h, small[0]), _shares(w, small[1]).T
-    weight, mean = np.zeros(small, np.float32), np.zeros(small, np.float32)
+    weight, mean, other = (np.zeros(small, np.float32) for _ in range(3))
     for row in range(0, h, STRIP):
         rows = slice(row, row + STRIP)
         weight += down[:, rows] @ (support[rows].astype(np.float32) @ across)
         mean += down[:, rows] @ (np.where(support[rows], z[rows], np.float32(0)) @ across)
+        if others is not None:
+            heights, worth = others(rows)
+            part = np.float32(FEW) * (worth & ~support[rows])
+            other += down[:, rows] @ (part @ across)
+            mean += down[:, rows] @ ((part * heights) @ across)
+    weight += other
     base = float(mean.sum() / weight.sum())
     total = mean - base * weight
     y, x = np.mgrid[: small[0], : small[1]].astype(np.float32) / COARSE
 
+    def around(part: NDArray[Any], share: float) -> NDArray[np.float64]:
+        return np.asarray(
+            cv2.GaussianBlur(
+                part.astype(np.float64), (0, 0), COARSE * share, borderType=cv2.BORDER_CONSTANT
+            )
+        )
+
     def spread(part: NDArray[Any]) -> NDArray[np.float64]:
         # a wide and a very wide surrounding: the second only counts where the first is empty
-        wide, widest = (
-            cv2.GaussianBlur(part.astype(np.float64), (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
-            for sigma in (COARSE / 12, COARSE / 3)
-        )
-        return np.asarray(wide + 1e-3 * widest)
+        return around(part, 1 / 12) + 1e-3 * around(part, 1 / 3)
 
     mass = spread(weight)
     cx, cy, m = (spread(part) / mass for part in (weight * x, weight * y, total))
@@ -110,7 +129,8 @@ def _planes(z: Float, support: Mask) -> Float:
     mx, my = spread(total * x) / mass - cx * m, spread(total * y) / mass - cy * m
     det = vxx * vyy - vxy * vxy
     sx, sy = (vyy * mx - vxy * my) / det, (vxx * my - vxy * mx) / det
-    return np.asarray(base + m + sx * (x - cx) + sy * (y - cy), np.float32)
+    plane = base + m + sx * (x - cx) + sy * (y - cy)
+    return np.asarray(plane, np.float32), np.asarray(spread(other) / mass, np.float32)
 
 
 def _shares(n: int, small: int) -> Float:

@@ -6,6 +6,7 @@ the baseline, H being the height of the centres over the plane. Semi-global matc
 2008, in OpenCV's variant) finds the shift of every pixel.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -195,3 +196,70 @@ def _rectified(
     u, v = (u + half) * scale - half, (v + half) * scale - half
     warped = cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(warped, np.uint8), seen
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Footprints:
+    """What each photo sees, on a raster of cells over all of them; row 0 in the south."""
+
+    corner: Array
+    """(2,) its west and south in m (map frame)."""
+    side: float
+    """Side of a cell in m."""
+    shape: tuple[int, int]
+    """Rows and columns."""
+    parts: Sequence[tuple[slice, slice, Mask]]
+    """Of each photo the rows and columns that it reaches, and which of these cells it sees."""
+
+    @classmethod
+    def of(cls, views: Sequence[View], height: float) -> "Footprints":
+        """Of photos `height` m above ground, of which cells are a 20th."""
+        outline = np.concatenate([v.footprint for v in views])
+        corner, far = outline.min(0), outline.max(0)
+        side = max(height / 20, float((far - corner).max()) / 4000)
+        rows, columns = (int(n) + 1 for n in np.ceil((far - corner) / side)[::-1])
+        parts = [_covered(v.footprint, corner, side, (rows, columns)) for v in views]
+        return cls(corner=corner, side=side, shape=(rows, columns), parts=parts)
+
+    def common(self, a: int, b: int) -> tuple[tuple[slice, slice], Mask]:
+        """The rows and columns that two photos both reach, and the cells there that both see."""
+        p, q = self.parts[a], self.parts[b]
+        rows, columns = (
+            slice(max(m.start, n.start), max(m.start, n.start, min(m.stop, n.stop)))
+            for m, n in zip(p[:2], q[:2], strict=True)
+        )
+        mine, other = (
+            mask[
+                rows.start - r.start : rows.stop - r.start,
+                columns.start - c.start : columns.stop - c.start,
+            ]
+            for r, c, mask in (p, q)
+        )
+        return (rows, columns), mine & other
+
+    def at(self, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.int16]:
+        """Number (h, w) of photos that see places at x (w,) and y (h,), in m."""
+        counts = np.zeros(self.shape, np.int16)
+        for rows, columns, mask in self.parts:
+            counts[rows, columns] += mask
+        row, column = (
+            np.floor((places - start) / self.side).astype(np.intp)
+            for places, start in ((y, self.corner[1]), (x, self.corner[0]))
+        )
+        inside = [(k >= 0) & (k < n) for k, n in zip((row, column), self.shape, strict=True)]
+        found = counts[
+            np.ix_(*(np.clip(k, 0, n - 1) for k, n in zip((row, column), self.shape, strict=True)))
+        ]
+        return np.where(np.outer(*inside), found, 0).astype(np.int16)
+
+
+def _covered(
+    outline: Array, corner: Array, side: float, shape: tuple[int, int]
+) -> tuple[slice, slice, Mask]:
+    """Rows and columns of a raster that an outline (k, 2) in m covers, and which of these cells."""
+    px = np.floor((outline - corner) / side).astype(np.int32)
+    low = np.clip(px.min(0), 0, None)
+    high = np.minimum(px.max(0) + 1, [shape[1], shape[0]])
+    mask = np.zeros((high[1] - low[1], high[0] - low[0]), np.uint8)
+    cv2.fillPoly(mask, [px - low.astype(np.int32)], (1,))
+    return slice(low[1], high[1]), slice(low[0], high[0]), mask > 0

@@ -4,13 +4,15 @@ Several pairs see every place; the median of their heights is kept, as Hirschmue
 (2010) do. The search is coarse to fine: small pictures over the whole range of heights find crowns
 and roofs as wholes; larger ones are matched where that shows relief, and believed where they agree
 with it. Where no pair gives a height, the coarser one stays; where none has any, heights go over to
-the plane through what is around.
+the plane through what is around, and further away to the heights of tie points, where two photos
+see the ground.
 """
 
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from functools import partial
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -33,7 +35,7 @@ from skyquilt.ortho.fusion import (
     without_specks,
 )
 from skyquilt.ortho.leaves import calmed
-from skyquilt.ortho.pair_matching import Array, Float, Mask, Pair, matched_points, pair_of
+from skyquilt.ortho.pair_matching import Float, Footprints, Mask, Pair, matched_points, pair_of
 
 GreyPicture = Callable[[int, int], NDArray[np.uint8]]
 """Gives the grey image (h, w) of a photo (index), reduced to the given px on its longest side."""
@@ -114,6 +116,8 @@ class Stereo:
     """Least and greatest ratio of baseline to height of a pair."""
     best_base: float = 0.25
     """The ratio that is preferred."""
+    widest: float = 1.2
+    """Greatest ratio of a pair where no other one shows the ground: photos that overlap little."""
     held_mb: float = 64.0
     """Heights of pairs in MB, about, that wait in memory for later tiles: pairs that do not fit are
     matched again.
@@ -122,7 +126,7 @@ class Stereo:
     """Side of a cell in pixels of the finest pictures that are matched, within `cell_px`."""
     cell_px: tuple[int, int] = (4, 8)
     """Least and greatest side of a cell in map pixels."""
-    version: ClassVar[int] = 7
+    version: ClassVar[int] = 8
 
     def __call__(
         self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture, keep: Keep
@@ -203,31 +207,27 @@ class Stereo:
             cv2.MORPH_CLOSE,
             cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (15, 15)),
         )
+        others = partial(_seen_twice, surface, Footprints.of(views, height), cells)
         # at once: photos drawn on a slope between crowns and the plane would become streaks
-        return surface_of(settled(whole, around > 0), cells), known
+        return surface_of(settled(whole, around > 0, others), cells), known
 
     def pairs(self, views: Sequence[View], height: float, wanted: int) -> list[tuple[View, View]]:
         """The pairs that are matched, of photos `height` m above ground: those with good baselines
         first, until every place is seen by `wanted` of them.
         """
         centre = np.array([v.pose.map_C[:2] for v in views])
-        i, j = pairs_within(centre, self.base[1] * height)
+        i, j = pairs_within(centre, self.widest * height)
         ratio = np.hypot(*(centre[j] - centre[i]).T) / height
         apart = ratio >= self.base[0]
         i, j, ratio = i[apart], j[apart], ratio[apart]
         order = np.lexsort((j, i, np.round(np.abs(np.log(ratio / self.best_base)), 1)))
-        outline = np.concatenate([v.footprint for v in views])
-        corner, far = outline.min(0), outline.max(0)
-        side = max(height / 20, float((far - corner).max()) / 4000)
-        shape = tuple(np.ceil((far - corner) / side).astype(int)[::-1] + 1)
-        counts = np.zeros(shape, np.int16)
-        covers = [_covered(v.footprint, corner, side, counts.shape) for v in views]
+        seen = Footprints.of(views, height)
+        counts = np.zeros(seen.shape, np.int16)
         chosen = []
-        for a, b in zip(i[order].tolist(), j[order].tolist(), strict=True):
-            (rows, columns), (mask_a, mask_b) = _common(covers[a], covers[b])
-            both = mask_a & mask_b
+        for a, b, far in zip(*(k[order].tolist() for k in (i, j, ratio)), strict=True):
+            (rows, columns), both = seen.common(a, b)
             part = counts[rows, columns]
-            new = both & (part < wanted)
+            new = both & (part < (wanted if far <= self.base[1] else 1))
             if new.any() and new.sum() > NEW * both.sum():
                 part += both
                 chosen.append((views[a], views[b]))
@@ -394,37 +394,14 @@ def _points(pair: Pair, level: Level, given: _Round) -> Float:
     return np.asarray(at[(z > given.low.at(x, y)) & (z < given.high.at(x, y))])
 
 
+def _seen_twice(surface: Surface, seen: Footprints, cells: Grid, rows: slice) -> tuple[Float, Mask]:
+    """Heights (n, w) of a surface at rows of cells, and which of them two photos see."""
+    x, y = cells.x(np.arange(cells.width)), cells.y(np.arange(cells.height)[rows])
+    return surface.at(*np.meshgrid(x, y)), seen.at(x, y) > 1
+
+
 def _stretched(surface: Surface, reach: float, kind: int, add: float) -> Surface:
     """The lowest or highest heights within `reach` m, moved by `add` m."""
     side = 2 * max(1, round(reach / surface.cell)) + 1
     z = cv2.morphologyEx(surface.z, kind, np.ones((side, side), np.uint8))
     return replace(surface, z=np.asarray(z + np.float32(add), np.float32))
-
-
-Covered = tuple[slice, slice, Mask]
-
-
-def _covered(outline: Array, corner: Array, side: float, shape: Any) -> Covered:
-    """Rows and columns of a raster that an outline (k, 2) in m covers, and which of these cells."""
-    px = np.floor((outline - corner) / side).astype(np.int32)
-    low = np.clip(px.min(0), 0, None)
-    high = np.minimum(px.max(0) + 1, [shape[1], shape[0]])
-    mask = np.zeros((high[1] - low[1], high[0] - low[0]), np.uint8)
-    cv2.fillPoly(mask, [px - low.astype(np.int32)], (1,))
-    return slice(low[1], high[1]), slice(low[0], high[0]), mask > 0
-
-
-def _common(a: Covered, b: Covered) -> tuple[tuple[slice, slice], tuple[Mask, Mask]]:
-    """The common rows and columns of two parts of a raster, and both masks there."""
-    inner = [
-        slice(max(p.start, q.start), max(p.start, q.start, min(p.stop, q.stop)))
-        for p, q in zip(a[:2], b[:2], strict=True)
-    ]
-    masks = [
-        m[
-            inner[0].start - r.start : inner[0].stop - r.start,
-            inner[1].start - c.start : inner[1].stop - c.start,
-        ]
-        for r, c, m in (a, b)
-    ]
-    return (inner[0], inner[1]), (masks[0], masks[1])
