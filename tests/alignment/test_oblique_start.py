@@ -8,6 +8,7 @@ import pytest
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.oblique_guess import LOWERED, guessed_priors, lowered
 from skyquilt.alignment.oblique_start import (
+    aslant,
     reported_start,
     slanting,
     tilt_warnings,
@@ -30,8 +31,10 @@ CAMERA = Camera.ideal(width=WIDTH, height=HEIGHT, focal=FOCAL)
 class Slanting:
     """Photos with known poses over rough ground, reported with errors of receivers."""
 
-    def __init__(self, places, *, gps=1.5, seed=0):
-        """`places`: x, y, z in m, yaw and pitch in degrees of each photo."""
+    def __init__(self, places, *, gps=1.5, seed=0, alike_deg=45):
+        """`places`: x, y, z in m, yaw and pitch in degrees of each photo; descriptors are alike
+        from directions up to `alike_deg` apart.
+        """
         rng = np.random.default_rng(seed)
         xyz = np.column_stack([rng.uniform(-110, 110, (5000, 2)), rng.gamma(0.7, 1.5, 5000)])
         self.truth, self.photos, self.priors, self.features, seen = [], [], [], [], []
@@ -62,7 +65,7 @@ class Slanting:
                     index_b=np.array([seen[j][p] for p in both], int),
                 )
                 turn = abs((places[j][3] - places[i][3] + 180) % 360 - 180)
-                if len(both) < 20 or turn > 45:  # no descriptor is alike from further apart
+                if len(both) < 20 or turn > alike_deg:
                     continue
                 link = Verify()(i, j, self.features[i], self.features[j], m, WIDTH)
                 if isinstance(link, Link):
@@ -109,6 +112,35 @@ def test_an_oblique_survey_is_placed(name):
     assert np.median(turned) < 1.0
 
 
+def there_and_back(pitch):
+    """Two flights over each other, across, the camera always `pitch` degrees ahead of the nadir."""
+    places = []
+    for heading in (0, 90):
+        for line, y in enumerate((-30, 0, 30)):
+            ways = [(x, y) for x in ((-22, 0, 22), (22, 0, -22))[line % 2]]
+            turn = 180 * (line % 2)
+            places += [
+                (*((y, x) if heading == 0 else (x, y)), 60.0, heading + turn, pitch)
+                for x, y in ways
+            ]
+    return places
+
+
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("pitch", [25, pytest.param(32, marks=pytest.mark.slow)])
+def test_photos_that_look_somewhat_aslant_are_placed_by_what_they_report(pitch, seed):
+    """Links of these, taken for similarities of the ground's plane, put half of such blocks where
+    all positions looked like gross errors, 11 to 16 m away.
+    """
+    flown = Slanting(there_and_back(pitch), seed=seed, alike_deg=180)
+    found = flown.aligned()
+    assert len(found.held) == len(flown.photos)
+    away = [np.linalg.norm(found.poses[i].map_C - t.map_C) for i, t in enumerate(flown.truth)]
+    assert np.median(away) < 1.5
+    # what positions of 1.5 m, 31 m from their middle, tell of the block's direction: 0.7 degrees
+    assert np.median(flown.errors(found)[1]) < 2.0
+
+
 def test_photos_that_do_not_tell_their_pose_hang_on_the_others():
     flown = Slanting(orbit(20, 50), seed=2)
     flown.priors[7] = prior((np.nan,) * 3, pitch=50)
@@ -126,6 +158,11 @@ def test_what_is_an_oblique_survey():
     level, tilted = prior((0, 0, 60.0)), prior((0, 0, 60.0), pitch=45)
     assert slanting([level] * 3 + [tilted] * 8)
     assert not slanting([level] * 8 + [tilted] * 3)
+    some = prior((0, 0, 60.0), pitch=20)
+    assert aslant([some] * 6 + [level] * 5)
+    assert not aslant([some] * 5 + [level] * 6)
+    assert not aslant([tilted] * 11)  # the survey itself is oblique
+    assert not aslant([some] * 5 + [prior((np.nan,) * 3, pitch=20)] * 6)
     flown = Slanting(orbit(12, 50))
     assert reported_start(flown.photos, flown.priors, flown.features, ()) is None
 

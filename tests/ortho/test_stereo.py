@@ -12,7 +12,7 @@ from skyquilt.model.camera import Camera
 from skyquilt.model.raster import Grid
 from skyquilt.ortho import fill, fusion, stereo
 from skyquilt.ortho.fill import crowns, filled, lowered, nearest_known, plateaus, settled
-from skyquilt.ortho.pair_matching import pair_of
+from skyquilt.ortho.pair_matching import Footprints, pair_of
 from skyquilt.ortho.stereo import Stereo
 from skyquilt.ortho.tie_surface import level
 from tests.ortho.scenes import FINE_M, GROUND, view
@@ -165,6 +165,71 @@ def test_beyond_the_support_lies_the_plane():
     far = out[20:180, 95:120]
     assert np.abs(far - (0.1 * x)[20:180, 95:120]).max() < 3.5
     assert np.abs(np.diff(out[20:180, 100:], axis=1)).max() < 0.3
+
+
+def test_far_from_the_support_other_heights_are_taken(monkeypatch):
+    """The plane of before next to the support, other heights far away, and a plane fitted to these
+    where they are worth nothing; never the slope continued to the rim.
+    """
+    x = np.mgrid[:300, :300][1].astype(np.float32)
+    support = x < 40
+    z = np.where(support, 0.5 * x, -99).astype(np.float32)
+    worth = (x > 60) & (np.mgrid[:300, :300][0] < 200)
+
+    def others(rows):
+        return np.full_like(z[rows], 12.0), worth[rows]
+
+    alone = settled(z.copy(), support)
+    assert alone[:, 290:].min() > 40  # what it mends
+    out = settled(z.copy(), support, others)
+    assert np.array_equal(out[support], z[support])
+    assert np.abs(out - alone)[20:180, 40:50].max() < 4
+    assert np.abs(out - 12)[20:180, 150:].max() < 0.5
+    assert np.abs(out - 12)[220:, 150:].max() < 5
+    monkeypatch.setattr(fill, "STRIP", 7)
+    assert settled(z.copy(), support, others) == pytest.approx(out, abs=1e-3)
+    assert settled(z.copy(), support, lambda rows: (z[rows], support[rows] & False)) == (
+        pytest.approx(alone, abs=1e-3)
+    )
+
+
+def test_long_baselines_serve_where_no_other_pair_shows_the_ground():
+    """Photos of 46 m of ground, 30 m apart (a ratio of 0.75), are pairs until one between them
+    shows the same ground from nearer.
+    """
+
+    def chosen(*places):
+        views = [view(k, x, 0, z=HEIGHT, camera=WIDE) for k, x in enumerate(places)]
+        return {(a.photo, b.photo) for a, b in Stereo().pairs(views, HEIGHT, 3)}
+
+    assert chosen(-30, 0, 30) == {(0, 1), (1, 2)}
+    assert chosen(-30, 0, 30, -15, 15) >= {(0, 3), (1, 3), (1, 4), (2, 4)}
+    assert not chosen(-30, 0, 30, -15, 15) & {(0, 1), (1, 2), (0, 2)}
+    assert not chosen(-60, 0, 60)  # 1.5 times the height apart, and nothing in common
+
+
+def test_photos_that_see_a_place_are_counted():
+    """As points inside convex outlines are, but for a cell at their rims."""
+    views = [view(k, 9.0 * k, 4.0 * (k % 2), z=HEIGHT, yaw=20.0 * k, camera=WIDE) for k in range(4)]
+    seen = Footprints.of(views, HEIGHT)
+    x, y = np.linspace(-60, 90, 151), np.linspace(-50, 50, 101)
+    wanted, rim = np.zeros((101, 151), int), np.zeros((101, 151), bool)
+    at = np.stack(np.meshgrid(x, y), -1)
+    for v in views:
+        along = np.roll(v.footprint, -1, 0) - v.footprint
+        off = at[:, :, None] - v.footprint
+        away = (along[:, 0] * off[..., 1] - along[:, 1] * off[..., 0]) / np.hypot(*along.T)
+        away = (away * np.sign(np.median(away[50, 75]))).min(-1)
+        wanted += away > 0
+        rim |= np.abs(away) < 3.0
+    assert np.array_equal(seen.at(x, y)[~rim], wanted[~rim])
+    assert (wanted[~rim] > 1).sum() > 500
+    (rows, columns), both = seen.common(0, 1)
+    counts = seen.at(
+        seen.corner[0] + (np.arange(columns.start, columns.stop) + 0.5) * seen.side,
+        seen.corner[1] + (np.arange(rows.start, rows.stop) + 0.5) * seen.side,
+    )
+    assert both.any() and counts[both].min() >= 2
 
 
 def test_gaps_of_tall_rasters_are_filled_in_bands_as_in_one(monkeypatch):

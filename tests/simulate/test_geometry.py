@@ -14,7 +14,7 @@ from skyquilt.simulate.flight import Shot, Waypoint
 from skyquilt.simulate.grid import Grid
 from skyquilt.simulate.raycast import first_hits, rays_of, sample
 from skyquilt.simulate.scene import Country, Scene, SceneSettings, empty_scene
-from skyquilt.simulate.settings import Pictures
+from skyquilt.simulate.settings import FlightSettings, Pictures
 from skyquilt.simulate.weather import Weather
 
 LENS = Lens(width=800, height=600, focal=667.0)
@@ -167,3 +167,19 @@ def test_blocks_make_the_same_country():
     a, b = whole.grid.inside(inner), part.grid.inside(inner)
     assert np.abs(whole.height[a] - part.height[b]).max() < 0.001
     assert np.mean(np.abs(whole.look[a] - part.look[b]).max(axis=-1) > 1) < 0.005
+
+
+@pytest.mark.parametrize(
+    ("k1", "folds"), [(-0.08, False), (-0.2, False), (-0.35, True), (-1.0, True), (0.1, False)]
+)
+def test_a_lens_that_folds_before_its_corners_is_refused(k1, folds):
+    """r (1 + k1 r^2) rises up to r = (-3 k1)^-0.5, to two thirds of that; corners lie at 0.71."""
+    lens = Lens(width=801, height=801, focal=800.0, k1=k1, k2=0, p1=0, p2=0, offset_x=0, offset_y=0)
+    highest = 2 / 3 * (-3 * k1) ** -0.5 if k1 < 0 else np.inf
+    assert lens.folds == folds == (highest < np.hypot(0.5, 0.5))
+    settings = FlightSettings(lens=lens)
+    if folds:
+        with pytest.raises(UsageError, match="corners of photos without rays"):
+            settings.checked()
+    else:
+        assert settings.checked() is settings

@@ -72,7 +72,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 53
+    version: ClassVar[int] = 54
 
     def __call__(
         self,
@@ -136,15 +136,15 @@ class Bundle:
         done = hung(found, weak, own, begun.priors, features, links, begun.aside)
         return replace(done, notes=(*done.notes, *notes)) if notes else done
 
-    def _in_space(self, priors: Sequence[Prior]) -> bool:
+    def _in_space(self, begun: Beginning) -> bool:
         """Whether the start takes what photos report for their poses."""
-        return self.repair and slanting(priors)
+        return self.repair and (begun.in_space or slanting(begun.told))
 
     def _begun(
         self,
         photos: Sequence[Photo],
         frame: MapFrame,
-        priors: Sequence[Prior],
+        begun: Beginning,
         features: Sequence[Features],
         links: Sequence[Link],
         keep: Keep,
@@ -155,8 +155,8 @@ class Bundle:
             AlignmentError: no two photos are linked.
         """
         features = [f.places for f in features]  # read once, though used many times
-        start, ground = None, ground_of(frame)
-        if self._in_space(priors):
+        start, ground, priors = None, ground_of(frame), begun.told
+        if self._in_space(begun):
             start = reported_start(photos, priors, features, links, ground)
         if start is None:
             start = _kept_start(photos, priors, features, links, ground, keep)
@@ -182,7 +182,7 @@ class Bundle:
     ) -> Alignment:
         """Adjusts the photos that these links connect."""
         priors = begun.told
-        start, tracks = self._begun(photos, frame, priors, features, links, keep)
+        start, tracks = self._begun(photos, frame, begun, features, links, keep)
         sizes = [(p.width, p.height) for p in photos]
         large = len(start.placed) > self.many
         setup = set_up(photos, priors, start, distortion=self.distortion, repair=self.repair)

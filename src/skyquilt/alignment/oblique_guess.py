@@ -70,9 +70,14 @@ def misled(found: Alignment, priors: Sequence[Prior], linked: int) -> bool:
     """
     if tilts_reported(priors) and not slanting(priors):
         return False
+    lost = len(found.held) < (1 - LOST) * linked
+    return lost or far_off(found, priors) or turned_far(found, priors)
+
+
+def far_off(found: Alignment, priors: Sequence[Prior]) -> bool:
+    """Whether photos lie further from their positions than these may err."""
     sigma = np.median([float(np.linalg.norm(priors[i].sigma_C)) for i in found.held] or [np.inf])
-    off = off_positions(found, priors) > OFF * sigma
-    return bool(off or turned_far(found, priors) or len(found.held) < (1 - LOST) * linked)
+    return bool(off_positions(found, priors) > OFF * sigma)
 
 
 def agrees(guessed: Alignment, found: Alignment) -> bool:

@@ -23,6 +23,8 @@ from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, Prior
 
 Array = NDArray[np.float64]
+ASLANT_DEG = 10.0
+"""Photos tilted by more than this (median) show that their links are no similarities."""
 APART = np.sin(np.radians(5.0))
 """Sine of the least angle between two rays that tell where they meet, positions erring by metres.
 """
@@ -41,6 +43,15 @@ FEWEST_MET = 50
 def slanting(priors: Sequence[Prior]) -> bool:
     """Whether the survey itself is oblique by what its photos report."""
     return sum(tilted(p) for p in priors) > MOST_OBLIQUE * len(priors)
+
+
+def aslant(priors: Sequence[Prior]) -> bool:
+    """Whether most photos tell their whole pose, and look aslant, though the survey is no oblique
+    one.
+    """
+    known = [cam_R_map_from_angles(0.0, p.pitch_deg, p.roll_deg) for p in priors if told(p)]
+    half = len(known) > len(priors) / 2
+    return half and not slanting(priors) and np.median([*map(tilt_deg, known)]) > ASLANT_DEG
 
 
 def told(prior: Prior) -> bool:

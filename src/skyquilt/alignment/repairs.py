@@ -15,8 +15,15 @@ from skyquilt.alignment.false_tilts import told_no_tilt
 from skyquilt.alignment.late_positions import as_moved, moved_note, on_time, unshifted
 from skyquilt.alignment.motion import Speeds
 from skyquilt.alignment.oblique import reported_oblique
-from skyquilt.alignment.oblique_guess import agrees, lowered, misled
-from skyquilt.alignment.oblique_start import nearer, off_positions, slanting, turned_priors, untold
+from skyquilt.alignment.oblique_guess import agrees, far_off, lowered, misled
+from skyquilt.alignment.oblique_start import (
+    aslant,
+    nearer,
+    off_positions,
+    slanting,
+    turned_priors,
+    untold,
+)
 from skyquilt.alignment.unfit_cameras import fits_as_well, unfit_notes
 from skyquilt.errors import AlignmentError
 from skyquilt.model.poses import Alignment, MapFrame, Prior
@@ -45,6 +52,8 @@ class Beginning:
     """Factors of photos that are enlarged against others of their camera."""
     loose: frozenset[str] = frozenset()
     """Cameras whose shutters and aspect ratios pictures alone tell."""
+    in_space: bool = False
+    """Photos begin where they report to be, as those of an oblique survey do."""
     name: str = ""
     """Tells parts of this adjustment that are kept from those of others."""
 
@@ -111,6 +120,19 @@ def repaired(first: Tried, survey: Survey) -> Tried:
     for repair in REPAIRS:
         first = repair(first, survey)
     return first
+
+
+def _as_reported(last: Tried, survey: Survey) -> Tried:
+    """Photos that look somewhat aslant begin as they report: links of these, taken for similarities
+    of the ground's plane, may put them where positions look like gross errors.
+    """
+    priors = last.begun.priors
+    if not aslant(priors) or not far_off(last.found, priors):
+        return last
+    other = survey.tried(last.begun, in_space=True, name="as reported ")
+    if nearer(other.found, last.found, priors) and agrees(other.found, last.found):
+        return other
+    return last
 
 
 def _enlargements(last: Tried, survey: Survey) -> Tried:
@@ -232,6 +254,7 @@ def priors_taken(
 
 
 REPAIRS: tuple[Callable[[Tried, Survey], Tried], ...] = (
+    _as_reported,
     _enlargements,
     _late_positions,
     _late_moments,

@@ -43,6 +43,8 @@ TILE = 512
 """Cells along a side of the pieces in which heights are fused."""
 NEW = 0.25
 """Share of the ground of a pair that must still lack pairs for it to be matched."""
+NEW_WIDE = 0.35
+"""The same of a pair with a long baseline: share that no other pair shows."""
 EDGES = 0.003
 """Share of a pair's ground that has edges where things stand on it."""
 
@@ -227,8 +229,9 @@ class Stereo:
         for a, b, far in zip(*(k[order].tolist() for k in (i, j, ratio)), strict=True):
             (rows, columns), both = seen.common(a, b)
             part = counts[rows, columns]
-            new = both & (part < (wanted if far <= self.base[1] else 1))
-            if new.any() and new.sum() > NEW * both.sum():
+            needed, share = (wanted, NEW) if far <= self.base[1] else (1, NEW_WIDE)
+            new = both & (part < needed)
+            if new.any() and new.sum() > share * both.sum():
                 part += both
                 chosen.append((views[a], views[b]))
         return chosen

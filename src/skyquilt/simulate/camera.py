@@ -124,6 +124,19 @@ class Lens:
             ideal_x, ideal_y = ideal_x * stretch, ideal_y * stretch
         return ideal_x, ideal_y
 
+    @property
+    def folds(self) -> bool:
+        """Whether distortion lays the picture over itself before its corners, so that these have no
+        ray.
+        """
+        flat = replace(self, fisheye=False)
+        x = (np.array([0.0, self.width - 1, 0, self.width - 1]) - self.cx) / self.focal
+        y = (np.array([0.0, 0, self.height - 1, self.height - 1]) - self.cy) / self.focal
+        with np.errstate(all="ignore"):
+            again = flat.distort(*flat.undistort(x, y / self.aspect))
+            off = np.hypot(again[0] - x, again[1] - y / self.aspect)
+        return not bool((off * self.focal < 1.0).all())
+
     def project(self, points: Doubles, rotation: Doubles, centre: Doubles) -> Doubles:
         """Pixels (n, 2) of map points (n, 3); NaN behind the camera.
 

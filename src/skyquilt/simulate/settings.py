@@ -341,6 +341,10 @@ def _other_rules(settings: FlightSettings) -> _Rules:
             "photos must be at least 64 px wide and high",
         ),
         (
+            not settings.lens.folds,
+            "the lens's distortion leaves the corners of photos without rays",
+        ),
+        (
             control.points >= 0 and control.checks >= 0,
             "numbers of control and check points must not be negative",
         ),
