@@ -8,6 +8,7 @@ the baseline, H being the height of the centres over the plane. Semi-global matc
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -237,20 +238,27 @@ class Footprints:
         )
         return (rows, columns), mine & other
 
-    def at(self, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.int16]:
-        """Number (h, w) of photos that see places at x (w,) and y (h,), in m."""
+    @cached_property
+    def counts(self) -> NDArray[np.int16]:
+        """Number (rows, columns) of photos that see each cell."""
         counts = np.zeros(self.shape, np.int16)
         for rows, columns, mask in self.parts:
             counts[rows, columns] += mask
-        row, column = (
-            np.floor((places - start) / self.side).astype(np.intp)
-            for places, start in ((y, self.corner[1]), (x, self.corner[0]))
-        )
-        inside = [(k >= 0) & (k < n) for k, n in zip((row, column), self.shape, strict=True)]
-        found = counts[
-            np.ix_(*(np.clip(k, 0, n - 1) for k, n in zip((row, column), self.shape, strict=True)))
-        ]
-        return np.where(np.outer(*inside), found, 0).astype(np.int16)
+        return counts
+
+    def showing(self, cells: Mask) -> Mask:
+        """Which photos (n,) see any of some cells (rows, columns)."""
+        return np.array([(cells[rows, columns] & mask).any() for rows, columns, mask in self.parts])
+
+    def at(self, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.int16]:
+        """Number (h, w) of photos that see places at x (w,) and y (h,), in m."""
+        inside, nearest = [], []
+        for places, start, n in zip((y, x), self.corner[::-1], self.shape, strict=True):
+            cell = np.floor((places - start) / self.side).astype(np.intp)
+            inside.append((cell >= 0) & (cell < n))
+            nearest.append(np.clip(cell, 0, n - 1))
+        seen = self.counts[np.ix_(*nearest)]
+        return np.where(np.outer(*inside), seen, 0).astype(np.int16)
 
 
 def _covered(

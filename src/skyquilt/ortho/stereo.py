@@ -223,17 +223,23 @@ class Stereo:
         apart = ratio >= self.base[0]
         i, j, ratio = i[apart], j[apart], ratio[apart]
         order = np.lexsort((j, i, np.round(np.abs(np.log(ratio / self.best_base)), 1)))
+        i, j, wide = i[order], j[order], ratio[order] > self.base[1]
         seen = Footprints.of(views, height)
         counts = np.zeros(seen.shape, np.int16)
         chosen = []
-        for a, b, far in zip(*(k[order].tolist() for k in (i, j, ratio)), strict=True):
-            (rows, columns), both = seen.common(a, b)
-            part = counts[rows, columns]
-            needed, share = (wanted, NEW) if far <= self.base[1] else (1, NEW_WIDE)
-            new = both & (part < needed)
-            if new.any() and new.sum() > share * both.sum():
-                part += both
-                chosen.append((views[a], views[b]))
+
+        def choose(some: NDArray[np.bool_], needed: int, share: float) -> None:
+            for a, b in zip(i[some].tolist(), j[some].tolist(), strict=True):
+                (rows, columns), both = seen.common(a, b)
+                part = counts[rows, columns]
+                new = both & (part < needed)
+                if new.any() and new.sum() > share * both.sum():
+                    part += both
+                    chosen.append((views[a], views[b]))
+
+        choose(~wide, wanted, NEW)
+        alone = seen.showing((counts == 0) & (seen.counts > 1))
+        choose(wide & alone[i] & alone[j], 1, NEW_WIDE)
         return chosen
 
     def _matched(
