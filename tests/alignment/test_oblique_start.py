@@ -141,6 +141,26 @@ def test_photos_that_look_somewhat_aslant_are_placed_by_what_they_report(pitch, 
     assert np.median(flown.errors(found)[1]) < 2.0
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("pitch", [25, 32])
+def test_photos_without_angles_among_those_that_look_aslant_hang_on_them(pitch):
+    """11 to 13 m away as well, before."""
+    flown = Slanting(there_and_back(pitch), seed=2, alike_deg=180)
+    for i in range(0, len(flown.priors), 3):
+        flown.priors[i] = replace(
+            flown.priors[i],
+            yaw_deg=np.nan,
+            sigma_yaw_deg=np.inf,
+            pitch_deg=0.0,
+            roll_deg=0.0,
+            sigma_tilt_deg=6.0,
+        )
+    found = flown.aligned()
+    assert len(found.held) == len(flown.photos)
+    away = [np.linalg.norm(found.poses[i].map_C - t.map_C) for i, t in enumerate(flown.truth)]
+    assert max(away) < 3.5
+
+
 def test_photos_that_do_not_tell_their_pose_hang_on_the_others():
     flown = Slanting(orbit(20, 50), seed=2)
     flown.priors[7] = prior((np.nan,) * 3, pitch=50)

@@ -14,7 +14,7 @@ from skyquilt.alignment.enlarged import enlarged_note, enlarged_photos, fits_bet
 from skyquilt.alignment.false_tilts import told_no_tilt
 from skyquilt.alignment.late_positions import as_moved, moved_note, on_time, unshifted
 from skyquilt.alignment.motion import Speeds
-from skyquilt.alignment.oblique import reported_oblique
+from skyquilt.alignment.oblique import reported_oblique, without_photos
 from skyquilt.alignment.oblique_guess import agrees, far_off, lowered, misled
 from skyquilt.alignment.oblique_start import (
     aslant,
@@ -124,13 +124,16 @@ def repaired(first: Tried, survey: Survey) -> Tried:
 
 def _as_reported(last: Tried, survey: Survey) -> Tried:
     """Photos that look somewhat aslant begin as they report: links of these, taken for similarities
-    of the ground's plane, may put them where positions look like gross errors.
+    of the ground's plane, may put them where positions look like gross errors. Photos that do not
+    report their pose are hung on the others.
     """
     priors = last.begun.priors
     if not aslant(priors) or not far_off(last.found, priors):
         return last
-    other = survey.tried(last.begun, in_space=True, name="as reported ")
-    if nearer(other.found, last.found, priors) and agrees(other.found, last.found):
+    aside = last.begun.aside | untold(priors)
+    other = survey.tried(last.begun, in_space=True, aside=aside, name="as reported ")
+    before = without_photos(last.found, dict.fromkeys(aside, "hung on the others"))
+    if nearer(other.found, before, priors) and agrees(other.found, before):
         return other
     return last
 
