@@ -191,6 +191,19 @@ def same_folder(a: Path, b: Path) -> bool:
     return os.path.realpath(a) == os.path.realpath(b)
 
 
+PHOTO_ENDINGS = (".jpg", ".jpeg", ".jpe", ".jfif", ".tif", ".tiff", ".png")
+"""Endings of photos' files, in lower case."""
+_NOT_PHOTOS = frozenset(
+    {"@eadir", "@recycle", "#recycle", "#snapshot", "$recycle.bin", "lost+found", "__macosx"}
+)
+"""Folders in which storage systems keep previews and what was removed, in lower case."""
+
+
+def hidden(name: str) -> bool:
+    """Whether a folder or file is none of the user's: hidden, a system's previews, or removed."""
+    return name.startswith(".") or name.lower() in _NOT_PHOTOS
+
+
 def walk(
     top: Path, unread: Callable[[Path, OSError], None] | None = None
 ) -> Iterator[tuple[Path, list[str], list[str]]]:

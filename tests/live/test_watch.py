@@ -105,6 +105,8 @@ def test_what_is_no_photo_by_its_name_or_not_ready_is_left_alone(watched, flight
         shutil.copyfile(flight.photos[0], watched.folder / name)
     (watched.folder / ".cache").mkdir()
     shutil.copyfile(flight.photos[0], watched.folder / ".cache" / "c.jpg")
+    (watched.folder / "@eaDir").mkdir()
+    shutil.copyfile(flight.photos[0], watched.folder / "@eaDir" / "thumbnail.jpg")
     assert watched.look(0.3) == []
     (watched.folder / "empty.jpg").touch()
     assert watched.look(0.3) == []  # it may be about to be written

@@ -39,6 +39,25 @@ def test_a_thumbnail_without_metadata_or_with_a_focal_length_in_other_pixels():
     assert left_out(taken("thumbs/DJI_0002.jpg", 2, width=240)) == {"thumbs/DJI_0002.jpg"}
 
 
+@pytest.mark.parametrize("name", ["DJI_0001_preview.jpg", "small-dji_0001.jpg", "0001.jpg"])
+def test_a_smaller_copy_whose_focal_length_counts_pixels_of_the_full_size(name):
+    """Pixels per mm of the sensor, which resizing does not change."""
+    assert left_out(taken(name, 1, width=2000, focal=3000.0)) == {name}
+
+
+@pytest.mark.parametrize("east", [-4e-6, 4e-6])
+@pytest.mark.parametrize("north", [-4e-6, 4e-6])
+def test_a_smaller_copy_whose_place_is_rounded(north, east):
+    """Seconds of arc with two decimals are up to 3e-6 degrees away."""
+    place = FULL[1].position
+    moved = replace(
+        place,
+        latitude_deg=place.latitude_deg + north,
+        longitude_deg=place.longitude_deg + east,
+    )
+    assert left_out(taken("small.jpg", 1, width=1000, focal=750.0, position=moved)) == {"small.jpg"}
+
+
 @pytest.mark.parametrize(
     "other",
     [

@@ -118,12 +118,14 @@ def test_hidden_files_and_earlier_runs_are_passed_over(make_jpeg):
     folder = flight(make_jpeg, 2)
     make_jpeg(".thumbs/p9.jpg", seed=30)
     make_jpeg(".p8.jpg", seed=31)
+    for k, system in enumerate(("@eaDir/p0.JPG", "__MACOSX", "#recycle", "$RECYCLE.BIN")):
+        make_jpeg(f"{system}/SYNOPHOTO_THUMB_XL.jpg", seed=40 + k)
     make_jpeg("out/mosaic.jpg", seed=32)
     (folder / "out" / "run.toml").write_text("")
     make_jpeg("live/map.jpg", seed=33)
     (folder / "live" / "live.db").write_text("")
     survey = read_survey(folder)
-    assert len(survey.photos) == 2
+    assert len(survey.photos) == 2 and not survey.rejected
     for name in ("out", "live"):
         assert any(f"The folder {name} contains an earlier run" in n for n in survey.notes)
 

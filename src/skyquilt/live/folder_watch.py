@@ -13,11 +13,10 @@ from skyquilt.live.inbox import ending_of, is_clip
 from skyquilt.live.ledger import hit
 from skyquilt.live.photo_intake import Accepted, Intake, Refused
 from skyquilt.model.photo import RejectedPhoto
-from skyquilt.outside import is_folder, open_regular, same_folder, walk
+from skyquilt.outside import PHOTO_ENDINGS, hidden, is_folder, open_regular, same_folder, walk
 from skyquilt.photos.read import read_photo
 from skyquilt.photos.survey import RUN_MARKS
 
-ENDINGS = (".jpg", ".jpeg", ".tif", ".tiff", ".png")
 PARTIAL = (".part", ".partial", ".tmp", ".crdownload", ".filepart")
 QUIET_S = 0.04
 """If the system does not report that a file was closed, the file is taken when it has not grown for
@@ -201,7 +200,7 @@ class Watch:
             if here != self.folder and not RUN_MARKS.isdisjoint((*names, *folders)):
                 folders.clear()
                 continue
-            folders[:] = [f for f in folders if not f.startswith(".")]
+            folders[:] = [f for f in folders if not hidden(f)]
             yield from (here / name for name in names if _photo_name(name))
 
     def _of_a_run(self, path: Path) -> bool:
@@ -248,7 +247,7 @@ def _stored(key: str) -> str:
 
 def _photo_name(name: str) -> bool:
     low = name.lower()
-    taken = low.endswith(ENDINGS) or is_clip(Path(low))
+    taken = low.endswith(PHOTO_ENDINGS) or is_clip(Path(low))
     return not low.startswith(".") and taken and not low.endswith(PARTIAL)
 
 

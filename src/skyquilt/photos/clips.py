@@ -11,6 +11,7 @@ import numpy as np
 from skyquilt.errors import SideFileError
 from skyquilt.model.clip import ChosenFrames, Clip, Track
 from skyquilt.model.photo import Photo, RejectedPhoto
+from skyquilt.outside import PHOTO_ENDINGS, hidden
 from skyquilt.photos.kept_frames import KEPT_QUALITY
 from skyquilt.photos.read import read_photo
 from skyquilt.photos.video_modes import with_mode
@@ -19,7 +20,6 @@ from skyquilt.video.read import read_clip
 from skyquilt.video.tracks import TRACK_ENDINGS, Fix, is_timed_csv, merged, read_track, track_of
 
 _SAME_START_S = 2.0
-_PHOTOS = frozenset({".jpg", ".jpeg", ".tif", ".tiff", ".png"})
 
 
 def is_timed(side: Path) -> bool:
@@ -59,7 +59,7 @@ def track_in_folder(folder: Path, clip: Path) -> Track:
 
     Raises `SideFileError` where there are none.
     """
-    files = sorted(p for p in folder.rglob("*") if p.is_file() and not p.name.startswith("."))
+    files = sorted(p for p in folder.rglob("*") if p.is_file() and not hidden(p.name))
     timed = [
         p
         for p in files
@@ -69,7 +69,7 @@ def track_in_folder(folder: Path, clip: Path) -> Track:
         if file.stem.lower() == clip.stem.lower():
             return read_track(file)
     tracks = [t for t in (_absolute(p) for p in timed) if t is not None]
-    tracks += _of_photos(folder, [p for p in files if p.suffix.lower() in _PHOTOS])
+    tracks += _of_photos(folder, [p for p in files if p.suffix.lower() in PHOTO_ENDINGS])
     if not tracks:
         raise SideFileError(
             f"{folder} contains no timed positions; expected .srt, .gpx or .csv files, or photos"

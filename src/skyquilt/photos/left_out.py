@@ -10,6 +10,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path, PurePosixPath
 
 from skyquilt.errors import UsageError
@@ -90,8 +91,9 @@ def without_maps(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[Reje
 def without_reduced(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[RejectedPhoto, ...]]:
     """The photos without smaller and without edited copies of others, and these with their reason.
 
-    A smaller copy states the same place and time and has the same angle of view or name; or it has
-    the same name and no metadata. An edited one states the same place and time, and its name says
+    A smaller copy states the same place and time, and has the same angle of view, the same camera
+    with its focal length in pixels of the full size, or the photo's name in its own; or it has the
+    same name and no metadata. An edited one states the same place and time, and its name says
     so.
     """
     alike: dict[Hashable, list[Photo]] = defaultdict(list)
@@ -143,8 +145,10 @@ def _keys(photo: Photo) -> Iterator[Hashable]:
     """What a photo shares with its copies."""
     place = photo.position
     if photo.time is not None and place is not None:
-        near = round(place.latitude_deg, 5), round(place.longitude_deg, 5)
-        yield photo.time, near, photo.band, photo.band_name
+        for shifts in product((0.0, ROUNDED_DEG / 2), repeat=2):  # two near ones share a cell
+            cell = (place.latitude_deg + shifts[0], place.longitude_deg + shifts[1])
+            near = tuple(round(deg / ROUNDED_DEG) for deg in cell)
+            yield photo.time, near, shifts, photo.band, photo.band_name
     yield _stem(photo)
 
 
@@ -165,7 +169,15 @@ def _is_reduced(photo: Photo, original: Photo) -> bool:
     if photo.position is None or not _at_one_place(photo, original):
         return False
     same_view = abs(photo.focal.px / original.focal.px / ratio - 1) < SAME
-    return same_view or _stem(photo) == _stem(original)
+    # programs that reduce photos keep what their metadata tell of the pixels of the full size
+    untouched = _any_size(photo) == _any_size(original)
+    untouched &= abs(photo.focal.px / original.focal.px - 1) < SAME
+    return same_view or untouched or _stem(original) in _stem(photo)
+
+
+def _any_size(photo: Photo) -> str:
+    """What metadata tell of the camera: make, model, lens and zoom, not the size of its pictures."""
+    return photo.camera_key.replace(f" {photo.width}x{photo.height}", "")
 
 
 def bands_of(photos: Sequence[Photo]) -> Counter[str]:

@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 
 from skyquilt.errors import NoPhotosError
 from skyquilt.model.photo import Photo, RejectedPhoto, Survey
-from skyquilt.outside import MOST_MP, plain, walk
+from skyquilt.outside import MOST_MP, PHOTO_ENDINGS, hidden, plain, walk
 from skyquilt.photos.cameras_json import apply_cameras, read_cameras_json
 from skyquilt.photos.clips import is_timed, read_clips
 from skyquilt.photos.implausible_positions import (
@@ -35,7 +35,6 @@ from skyquilt.photos.thermal import UNSTATED
 from skyquilt.settings import InputSettings
 from skyquilt.video.read import CLIP_ENDINGS, side_files
 
-_PHOTO_ENDINGS = frozenset({".jpg", ".jpeg", ".tif", ".tiff", ".png"})
 _OTHER_PICTURES = frozenset(
     f".{ending}"
     for ending in (
@@ -70,7 +69,7 @@ class FoundFiles:
 def find_files(source: Path | Sequence[Path]) -> FoundFiles:
     """Finds photos by file name extension in a folder and its subfolders, or among single files.
 
-    Hidden files and folders are skipped, and so are folders of earlier runs (they contain
+    Hidden files and folders are skipped, those of storage systems (`@eaDir`, `__MACOSX`) too, and so are folders of earlier runs (they contain
     `run.toml`, or `.skyquilt` while a run is not finished) and of live maps. Raises `UsageError`
     where a given path does not exist.
     """
@@ -102,8 +101,8 @@ def _walk(
             runs.append(_text(here.relative_to(top).as_posix()))
             folders.clear()
             continue
-        folders[:] = [f for f in folders if not f.startswith(".")]
-        yield from (here / f for f in files if not f.startswith("."))
+        folders[:] = [f for f in folders if not hidden(f)]
+        yield from (here / f for f in files if not hidden(f))
 
 
 def _listed(paths: Sequence[Path]) -> FoundFiles:
@@ -135,7 +134,7 @@ def _text(name: str) -> str:
 def _sorted(
     files: Sequence[tuple[str, Path]], geo: Path | None, runs: tuple[str, ...]
 ) -> FoundFiles:
-    photos = sorted((n, p) for n, p in files if p.suffix.lower() in _PHOTO_ENDINGS)
+    photos = sorted((n, p) for n, p in files if p.suffix.lower() in PHOTO_ENDINGS)
     clips = sorted((n, p) for n, p in files if p.suffix.lower() in CLIP_ENDINGS)
     known = {n for n, _ in (*photos, *clips)}
     beside = {p for _, clip in clips for p in side_files(clip)}
