@@ -51,9 +51,7 @@ def test_a_smaller_copy_whose_place_is_rounded(north, east):
     """Seconds of arc with two decimals are up to 3e-6 degrees away."""
     place = FULL[1].position
     moved = replace(
-        place,
-        latitude_deg=place.latitude_deg + north,
-        longitude_deg=place.longitude_deg + east,
+        place, latitude_deg=place.latitude_deg + north, longitude_deg=place.longitude_deg + east
     )
     assert left_out(taken("small.jpg", 1, width=1000, focal=750.0, position=moved)) == {"small.jpg"}
 

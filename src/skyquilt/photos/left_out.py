@@ -176,7 +176,7 @@ def _is_reduced(photo: Photo, original: Photo) -> bool:
 
 
 def _any_size(photo: Photo) -> str:
-    """What metadata tell of the camera: make, model, lens and zoom, not the size of its pictures."""
+    """What metadata tell of the camera (make, model, lens, zoom), without the size of pictures."""
     return photo.camera_key.replace(f" {photo.width}x{photo.height}", "")
 
 

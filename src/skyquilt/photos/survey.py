@@ -69,8 +69,9 @@ class FoundFiles:
 def find_files(source: Path | Sequence[Path]) -> FoundFiles:
     """Finds photos by file name extension in a folder and its subfolders, or among single files.
 
-    Hidden files and folders are skipped, those of storage systems (`@eaDir`, `__MACOSX`) too, and so are folders of earlier runs (they contain
-    `run.toml`, or `.skyquilt` while a run is not finished) and of live maps. Raises `UsageError`
+    Hidden files and folders are skipped, those of storage systems (`@eaDir`, `__MACOSX`) too, and
+    so are folders of earlier runs (they contain `run.toml`, or `.skyquilt` while a run is not
+    finished) and of live maps. Raises `UsageError`
     where a given path does not exist.
     """
     paths = paths_of(source)
