@@ -2,9 +2,11 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
+from skyquilt.imaging.blank import around
 from skyquilt.imaging.nodes import STEP, densify, inside_everywhere, node_places, project_nodes
 from skyquilt.imaging.view_limits import (
     COARSEST,
@@ -15,6 +17,7 @@ from skyquilt.imaging.view_limits import (
     support_of,
 )
 from skyquilt.imaging.views import footprint
+from skyquilt.live.tile_drawing import Newest
 from skyquilt.model.raster import Grid, Window
 from skyquilt.ortho.blend import Average, Feather
 from skyquilt.ortho.plan import planned
@@ -131,3 +134,28 @@ def test_a_smeared_view_yields_where_another_photo_is_sharp(blend):
     alone = planned(window, grid, [high], FLAT, blend, counted=True, earlier=None)
     assert alone.nodes[0].seen.all()
     assert STEP == 16
+
+
+@pytest.mark.parametrize("blend", [Feather(), Newest()])
+def test_a_marked_part_yields_where_another_photo_shows_the_ground(blend):
+    """The left half of the newer, more vertical photo is marked; both photos see the same place."""
+    half = np.zeros((48, 64), np.bool_)
+    half[:, :32] = True
+    other = view(0, -12, 0)
+    size = other.camera.width, other.camera.height
+    marked = replace(view(1, 0, 0), limits=ViewLimits(mark=around(half, size)))
+    grid = Grid(west=-64.0, north=64.0, gsd=0.25, width=512, height=512)
+    window = Window(row=0, column=0, height=512, width=512)
+    x, y, z = node_places(grid, FLAT, window)
+    free, also = project_nodes(marked, x, y, z), project_nodes(other, x, y, z).seen
+    white = free.seen & (free.u < 0.45 * size[0])
+    inner = cv2.erode(also.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    plan = planned(window, grid, [other, marked], FLAT, blend, counted=False, earlier=None)
+    now = {n.view.photo: n for n in plan.nodes}
+    assert (white & inner).sum() > 20
+    assert not now[1].seen[white & inner].any()
+    left = free.seen & ((free.u > 0.55 * size[0]) | ~also)
+    assert now[1].seen[left].all()
+    assert dict(zip(now, plan.near, strict=True))[0][white & inner].all()
+    alone = planned(window, grid, [marked], FLAT, blend, counted=False, earlier=None)
+    assert np.array_equal(alone.nodes[0].seen, free.seen)

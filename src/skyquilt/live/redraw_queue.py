@@ -12,12 +12,16 @@ from skyquilt.live.ledger import DAMAGED, hit
 from skyquilt.live.members import Member, Members, pose_from, pose_record
 from skyquilt.live.tile_drawing import LEAST_MOVE, NEWEST, Canvas
 from skyquilt.model.poses import Pose
+from skyquilt.ortho.spoilt import overexposed_note
+from skyquilt.outside import whole
 from skyquilt.raster.tile_store import Address
 
 DRAWN_AT_ONCE = 12
 """Number of tiles drawn in one unit of work; twice as many for a new photo."""
 NOTED_AT_ONCE = 8
 """Number of moved photos whose tiles are determined in one unit of work."""
+WHITE, MOST_NOTED = "overexposed", 10**9
+"""Name in the ledger of the number of overexposed photos that were noted last, and most of them."""
 Queue = dict[Address, set[int]]
 """Tiles to draw, in order, with the photos that have changed on each."""
 
@@ -41,6 +45,7 @@ class RedrawQueue:
         self._rims: dict[int, NDArray[np.float64]] = {}
         self._to_draw: set[int] = set()
         self._fresh: dict[str, list[Address]] = {}
+        self._noted = whole(self.ledger.meta(WHITE, 0), 0, MOST_NOTED) or 0
         self._take_up()
 
     def _take_up(self) -> None:
@@ -60,7 +65,21 @@ class RedrawQueue:
     def show(self, member: Member) -> None:
         """Queues the tiles of a new photo as urgent."""
         self._to_draw.add(member.id)
-        _add(self.urgent, self.canvas.place(member, self.members.camera(member)), member.id)
+        _add(self.urgent, self._placed(member), member.id)
+
+    def _placed(self, member: Member) -> set[Address]:
+        """Places a photo on the map; returns the tiles that may look different. Overexposed photos
+        are noted whenever there are twice as many of them.
+        """
+        addresses = self.canvas.place(member, self.members.camera(member))
+        white = self.canvas.white() if self.canvas.is_white(member.id) else []
+        if len(white) >= max(1, 2 * self._noted):
+            self._noted = len(white)
+            note = overexposed_note([self.members.by_id[i].photo.name for i in white])
+            with self.ledger.change():
+                self.ledger.put_meta(WHITE, self._noted)
+                self.ledger.tell("note", {"text": note if len(white) < 2 else f"So far {note}"})
+        return addresses
 
     def changed(self, member: Member) -> None:
         """Notes that a photo looks different; its tiles are determined later."""
@@ -81,7 +100,7 @@ class RedrawQueue:
             del self.pending[number]
             if member.state == "superseded":
                 continue
-            addresses = self.canvas.place(member, self.members.camera(member))
+            addresses = self._placed(member)
             if self._looks_as_drawn(number):
                 self._to_draw.discard(number)
             else:

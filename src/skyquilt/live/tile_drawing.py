@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.store import Store
 from skyquilt.engine.workers import Threads
+from skyquilt.imaging.blank import Blank
+from skyquilt.imaging.grey import shrink
 from skyquilt.imaging.nodes import View
 from skyquilt.imaging.view_limits import COARSEST, ViewLimits, limits_for
 from skyquilt.imaging.views import footprint
@@ -31,6 +33,7 @@ from skyquilt.ortho.compose import Composed, Composer
 from skyquilt.ortho.exposure import Exposure
 from skyquilt.ortho.height_cells import HeightCells
 from skyquilt.ortho.plan import Plan
+from skyquilt.ortho.spoilt import overexposed
 from skyquilt.raster.tile_store import SIDE, Address, Tile, TileStore, covering
 
 
@@ -75,6 +78,8 @@ are redrawn.
 """
 RECENT = 200
 """Number of photos from which the median ground size of a pixel is taken."""
+LOOKED_AT = 128
+"""Longest side in px of the pictures in which overexposed parts are looked for."""
 THREADS = min(2, os.cpu_count() or 1)
 """Number of tiles drawn in parallel."""
 WHOLE = Window(row=0, column=0, height=SIDE, width=SIDE)
@@ -127,6 +132,7 @@ class Canvas:
         self._kept: OrderedDict[Address, Drawing] = OrderedDict()
         self._by_tile: dict[Address, set[int]] = defaultdict(set)
         self._pictures = SmallPictures(full, members, store)
+        self._white: dict[int, Blank | None] = {}
         self._tone = Tone(self._pictures)
 
     def place(self, member: Member, camera: Camera) -> set[Address]:
@@ -198,12 +204,31 @@ class Canvas:
         surface = self.surface((x - reach, y - reach, x + reach, y + reach))
         self._sizes[member.id] = abs(z - self.ground) / camera.focal
         limits = self._limits(small, pose, surface)
+        if (white := self._overexposed(member, (w, h))) is not None:
+            limits = replace(limits, mark=white)
         outline = footprint(small, pose, surface, limits=limits)
         return (
             View(photo=member.id, camera=small, pose=pose, footprint=outline, limits=limits)
             if len(outline)
             else None
         )
+
+    def _overexposed(self, member: Member, size: tuple[int, int]) -> Blank | None:
+        """Where a photo, drawn at this width and height in px, is overexposed; looked for once."""
+        if layer_of(member) == "thermal":  # white is warm
+            return None
+        if member.id not in self._white:
+            small = shrink(self._pictures(member.id), LOOKED_AT)[0]
+            self._white[member.id] = overexposed(small, size)
+        return self._white[member.id]
+
+    def is_white(self, number: int) -> bool:
+        """Whether a photo is on the map and overexposed in part."""
+        return number in self._views and self._white.get(number) is not None
+
+    def white(self) -> list[int]:
+        """The photos of which that is true, ascending."""
+        return sorted(i for i in self._white if self.is_white(i))
 
     def _limits(self, camera: Camera, pose: Pose, surface: Surface) -> ViewLimits:
         """What a photo may show: no more than near the heights known now, and near its nadir."""

@@ -21,7 +21,7 @@ from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.blend import Blend
 from skyquilt.ortho.labels import Labels
-from skyquilt.ortho.smears import smeared, yielding
+from skyquilt.ortho.smears import badly_shown, yielding
 
 TOGETHER = 6
 """Number of photos projected at a time."""
@@ -112,7 +112,7 @@ def planned(
         if nodes.seen.any():
             rank = blend.rank(k, np.where(nodes.seen, nodes.score, np.float32(np.inf)))
             found[k] = nodes, cv2.erode(rank, around)
-            if (smear := smeared(nodes, grid.gsd)).any():
+            if (smear := badly_shown(nodes, grid.gsd)).any():
                 smears[k] = smear
                 rank = np.where(smear, np.float32(np.inf), rank)  # it hides no other photo there
             best = np.minimum(best, cv2.dilate(rank, around))

@@ -1,4 +1,4 @@
-"""Where a photo's pixels are smeared over the ground, it yields to sharper photos."""
+"""Where a photo's pixels are smeared over the ground, or show it badly, it yields to others."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -25,6 +25,12 @@ def smeared(nodes: Nodes, gsd: float) -> Mask:
     if not possible.any():
         return possible
     return np.asarray(possible & (ground_sizes(nodes.u, nodes.v, STEP * gsd) > limit))
+
+
+def badly_shown(nodes: Nodes, gsd: float) -> Mask:
+    """(r, c) where a photo is smeared, or shows a mark of its limits; `gsd`: m per map pixel."""
+    found, mark = smeared(nodes, gsd), nodes.view.limits.mark
+    return found if mark is None else found | (nodes.seen & (mark.at(nodes.u, nodes.v) < 0))
 
 
 def yielding(nodes: Nodes, smear: Mask, others: Sequence[tuple[Nodes, Mask | None]]) -> Nodes:

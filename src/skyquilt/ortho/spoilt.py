@@ -33,28 +33,34 @@ def spoilt_parts(
     blurred, notes = find_blurred(alignment, details, names)
     white = dict[int, Blank]()
     for i in sorted(alignment.poses):
-        if part := _white(alignment, i, thumbnails[i]):
+        camera = alignment.camera(i)
+        if part := overexposed(thumbnails[i], (camera.width, camera.height)):
             white[i] = part
     if white:
-        listed = sentence_of([names[i] for i in white])
-        some = f"{len(white)} photos are" if len(white) > 1 else "One photo is"
-        notes += (
-            f"{some} overexposed in part ({listed}): what is white there is drawn only where no"
-            " other photo shows the ground.",
-        )
+        notes += (overexposed_note([names[i] for i in white]),)
     out = dict(fixed)
     for found in (blurred, white):
         out |= {i: joined(out[i], b) if i in out else b for i, b in found.items()}
     return out, notes
 
 
-def _white(alignment: Alignment, photo: int, thumbnail: NDArray[Any]) -> Blank | None:
-    """Where a photo is overexposed; None where it is not, or has no 8-bit values."""
+def overexposed_note(names: Sequence[str]) -> str:
+    """A note about overexposed photos of these names, at least one."""
+    some = f"{len(names)} photos are" if len(names) > 1 else "One photo is"
+    return (
+        f"{some} overexposed in part ({sentence_of(names)}): what is white there is drawn only"
+        " where no other photo shows the ground."
+    )
+
+
+def overexposed(thumbnail: NDArray[Any], size: tuple[int, int]) -> Blank | None:
+    """Where a photo of a `size` (width and height in px) is overexposed, from its reduced picture
+    (h, w[, bands]); None where it is not, or has no 8-bit values.
+    """
     if thumbnail.dtype != np.uint8:
         return None
     lightest = thumbnail if thumbnail.ndim == 2 else thumbnail.max(2)
     white = np.asarray(lightest >= WHITE)
     if white.mean() <= LEAST_WHITE:
         return None
-    camera = alignment.camera(photo)
-    return around(white, (camera.width, camera.height))
+    return around(white, size)
