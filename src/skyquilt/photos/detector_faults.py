@@ -19,6 +19,8 @@ Values = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 _NEAR = 5
 """Side in px of the neighbourhood with whose median a pixel is compared."""
+_SLOW = 6.0
+"""Scale in px of changes along a picture that are not those of single lines (standard deviation)."""
 _TINY = 1e-6
 
 
@@ -54,8 +56,12 @@ class FindFaults:
     """Parts of a column's length, each of which must show that it differs: what lies along columns on
     the ground is hardly ever quite straight in the picture.
     """
-    alike: float = 0.7
+    alike: float = 0.5
     """Least correlation of what these parts and both halves of the flight show."""
+    smooth: float = 0.5
+    """Correlation of neighbouring columns from which they show ground: the lens blurs it over more than
+    one pixel, while each column of a detector has an error of its own.
+    """
     version: ClassVar[int] = 1
 
     def __call__(self, frames: Sequence[Values]) -> DetectorFaults | None:
@@ -83,8 +89,9 @@ class FindFaults:
         """Frames that do not show the same ground at the same place."""
         kept, seen = list[Values](), list[NDArray[np.float32]]()
         for frame in frames:
-            grey = _whole(frame)
-            # lines and single pixels, which are what is looked for, are hardly left at this scale
+            # without lines and single pixels, which are what is looked for
+            grey = cv2.medianBlur(_whole(frame), _NEAR)
+            grey = np.clip(grey, *np.percentile(grey, [1, 99]).tolist()).astype(np.float32)
             view = cv2.GaussianBlur(grey, (0, 0), 4) - cv2.GaussianBlur(grey, (0, 0), 16)
             view = view / max(float(np.linalg.norm(view)), _TINY)
             if all(float(np.vdot(view, s)) < self.same_view for s in seen):
@@ -100,20 +107,30 @@ class FindFaults:
         off = whole - np.stack([cv2.medianBlur(f, _NEAR) for f in whole])
         half = len(frames) // 2
         first, second = np.median(off[:half], 0), np.median(off[half:], 0)
-        same = np.maximum((off > 0).mean(0), (off < 0).mean(0)) >= self.lasting
-        outlying = (first * second > 0) & self._far(first) & self._far(second) & same
+        scales = _scale(first), _scale(second)
+        outlying = self._outlying(off, scales)
         changes = _spread(whole - np.median(whole, (1, 2), keepdims=True))
         around = cv2.medianBlur(changes, _NEAR)
         # a stuck pixel keeps its value whatever its neighbours do, and seldom has theirs: those of a
         # saturated picture keep theirs, too
         apart = (np.abs(off) > self.stuck * around).mean(0) >= self.apart
         stuck = (_spread(whole) < self.stuck * around) & apart
-        bad = self._thin(void | outlying | stuck)
+        sure = void | stuck
+        # bad ones beside it may have made a good one an outlier: it is compared with good ones only
+        mended = np.stack([filled(f, sure | outlying) for f in whole])
+        outlying &= self._outlying(np.where(np.isnan(mended), off, whole - mended), scales)
+        bad = self._thin(sure | outlying)
         return bad if bad.mean() <= self.most else np.zeros_like(bad)
 
-    def _far(self, off: NDArray[np.float32]) -> Mask:
-        scale = 1.4826 * float(np.median(np.abs(off - np.median(off))))
-        return np.asarray(np.abs(off) > self.outlying * max(scale, _TINY))
+    def _outlying(self, off: NDArray[np.float32], scales: tuple[float, float]) -> Mask:
+        """(h, w) which pixels are off (n, h, w) their neighbours to the same side in nearly all frames
+        and far off in either half of them; `scales`: the standard deviation of all in each half.
+        """
+        half = len(off) // 2
+        first, second = np.median(off[:half], 0), np.median(off[half:], 0)
+        far = [np.abs(o) > self.outlying * s for o, s in zip((first, second), scales, strict=True)]
+        same = np.maximum((off > 0).mean(0), (off < 0).mean(0)) >= self.lasting
+        return np.asarray((first * second > 0) & far[0] & far[1] & same)
 
     def _thin(self, bad: Mask) -> Mask:
         """Without areas that contain squares."""
@@ -133,7 +150,7 @@ class FindFaults:
         high = []
         for frame in frames:
             grey = _whole(frame)
-            high.append(grey - cv2.GaussianBlur(grey, (0, 0), sigmaX=6, sigmaY=0.01))
+            high.append(grey - cv2.GaussianBlur(grey, (0, 0), sigmaX=_SLOW, sigmaY=0.01))
         stack, half = np.stack(high), len(frames) // 2
         parts = [
             np.median(part, (0, 1))
@@ -145,7 +162,16 @@ class FindFaults:
             return np.zeros(width, np.float32)
         if np.corrcoef(parts).min() < self.alike:
             return np.zeros(width, np.float32)
-        return np.asarray(np.median(parts, 0), np.float32)
+        found = np.median(parts, 0)
+        if np.corrcoef(found[1:], found[:-1])[0, 1] > self.smooth:
+            return np.zeros(width, np.float32)
+        # what changes slowly along the picture is the ground's, or a pattern (`ortho.frame_pattern`)
+        return np.asarray(found - cv2.GaussianBlur(found[None], (0, 0), _SLOW)[0], np.float32)
+
+
+def _scale(off: NDArray[Any]) -> float:
+    """Robust standard deviation."""
+    return max(1.4826 * float(np.median(np.abs(off - np.median(off)))), _TINY)
 
 
 def _spread(stack: NDArray[Any]) -> NDArray[np.float32]:
