@@ -65,12 +65,13 @@ def test_bad_pixels_are_found_and_mended(bad, value):
     found = np.zeros(H * W, bool)
     found[faults.bad] = True
     found = found.reshape(H, W)
-    assert (found & bad).sum() >= 0.97 * bad.sum()
+    assert (found & bad).sum() >= 0.98 * bad.sum()
     assert (found & ~bad).sum() <= 0.001 * bad.size
     mended = repaired(np.where(bad, value, true[4]), faults)
     left = np.abs(mended - true[4])[found & bad]
     assert np.median(left) < 0.4  # an interpolation across the ground's own texture
-    assert np.array_equal(mended[~found], true[4][~found])
+    good = ~found & ~bad
+    assert np.array_equal(mended[good], true[4][good])
 
 
 def test_errors_of_columns_and_rows_are_taken_off():

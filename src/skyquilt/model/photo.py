@@ -157,7 +157,7 @@ class Photo:
     stored: Stored = ""
     """What a value of a thermal TIFF means as stored in the file; empty for other files."""
     faults: DetectorFaults | None = None
-    """Faults of its detector, which are mended when its pixels are read; None where none are known."""
+    """Faults of its detector, mended when its pixels are read; None where none are known."""
     camera_key: str
     """Photos with equal keys share their intrinsics: make, model, serial, lens, size, zoom."""
     calibration: Camera | None = None

@@ -1,6 +1,6 @@
-"""Faults of a thermal camera's detector: pixels that are dead, stuck or hot, and columns and rows that
-are warmer or colder than they ought to be. They stay at their places of the picture while the ground
-moves on, so the frames of a flight tell them.
+"""Faults of a thermal camera's detector: pixels that are dead, stuck or hot, and columns and rows
+that are warmer or colder than they ought to be. They stay at their places of the picture while the
+ground moves on, so the frames of a flight tell them.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,13 +20,14 @@ Mask = NDArray[np.bool_]
 _NEAR = 5
 """Side in px of the neighbourhood with whose median a pixel is compared."""
 _SLOW = 6.0
-"""Scale in px of changes along a picture that are not those of single lines (standard deviation)."""
+"""Standard deviation in px of the smoothing that leaves no errors of single lines."""
 _TINY = 1e-6
+_BESIDE = np.ones((3, 3), np.uint8)
 
 
 @dataclass(frozen=True, kw_only=True)
 class FindFaults:
-    """Looks for faults in some frames of each camera. What both halves of the flight show counts, so
+    """Looks for faults in some frames of a camera. What both halves of the flight show counts, so
     that the ground does not; frames that show the same ground at the same place count once.
     """
 
@@ -35,8 +36,8 @@ class FindFaults:
     fewest: int = 6
     """Fewest of them, of different ground."""
     same_view: float = 0.5
-    """Correlation of two frames, without fine detail and slow changes, from which they show the same
-    ground at the same place.
+    """Correlation of two frames, without fine detail and slow changes, from which they show the
+    same ground at the same place.
     """
     outlying: float = 6.0
     """Standard deviations of the other pixels by which a bad one differs in either half."""
@@ -45,7 +46,9 @@ class FindFaults:
     lasting: float = 0.9
     """Share of frames in which it must differ to the same side."""
     apart: float = 0.75
-    """Share of frames in which a stuck pixel differs from its neighbours by more than its own changes."""
+    """Share of frames in which a stuck pixel differs from its neighbours by so much."""
+    rounds: int = 3
+    """Rounds of the search: where bad lines cross, most neighbours are bad, too."""
     most: float = 0.05
     """Largest share of bad pixels: more are no faults of single ones."""
     thick: int = 4
@@ -53,14 +56,14 @@ class FindFaults:
     (`matching.fixed_marks`), and areas without measurements stay so.
     """
     bands: int = 8
-    """Parts of a column's length, each of which must show that it differs: what lies along columns on
-    the ground is hardly ever quite straight in the picture.
+    """Parts of a column's length, each of which must show that it differs: what lies along columns
+    on the ground is hardly ever quite straight in the picture.
     """
     alike: float = 0.5
     """Least correlation of what these parts and both halves of the flight show."""
     smooth: float = 0.5
-    """Correlation of neighbouring columns from which they show ground: the lens blurs it over more than
-    one pixel, while each column of a detector has an error of its own.
+    """Correlation of neighbouring columns from which they show ground: the lens blurs it over more
+    than one pixel, while each column of a detector has an error of its own.
     """
     version: ClassVar[int] = 1
 
@@ -101,30 +104,37 @@ class FindFaults:
 
     def _bad(self, frames: Sequence[Values]) -> Mask:
         """(h, w) pixels that are no measurements."""
-        stack = np.stack(frames)
-        void = np.isnan(stack).mean(0) > 0.5
         whole = np.stack([_whole(f) for f in frames])
-        off = whole - np.stack([cv2.medianBlur(f, _NEAR) for f in whole])
-        half = len(frames) // 2
-        first, second = np.median(off[:half], 0), np.median(off[half:], 0)
-        scales = _scale(first), _scale(second)
-        outlying = self._outlying(off, scales)
-        changes = _spread(whole - np.median(whole, (1, 2), keepdims=True))
-        around = cv2.medianBlur(changes, _NEAR)
-        # a stuck pixel keeps its value whatever its neighbours do, and seldom has theirs: those of a
-        # saturated picture keep theirs, too
-        apart = (np.abs(off) > self.stuck * around).mean(0) >= self.apart
-        stuck = (_spread(whole) < self.stuck * around) & apart
-        sure = void | stuck
-        # bad ones beside it may have made a good one an outlier: it is compared with good ones only
-        mended = np.stack([filled(f, sure | outlying) for f in whole])
-        outlying &= self._outlying(np.where(np.isnan(mended), off, whole - mended), scales)
-        bad = self._thin(sure | outlying)
+        void = np.asarray(np.isnan(np.stack(frames)).mean(0) > 0.5)
+        bad = void
+        for _ in range(self.rounds):
+            before, bad = bad, void | self._beside(whole, bad)
+            if np.array_equal(before, bad):
+                break
+        bad = self._thin(bad)
         return bad if bad.mean() <= self.most else np.zeros_like(bad)
 
+    def _beside(self, whole: NDArray[np.float32], bad: Mask) -> Mask:
+        """Pixels (h, w) that look bad beside the others, without those taken for bad so far."""
+        mended = np.stack([_whole(filled(f, bad)) for f in whole])
+        off = whole - np.stack([cv2.medianBlur(f, _NEAR) for f in mended])
+        half = len(whole) // 2
+        scales = _scale(np.median(off[:half], 0)), _scale(np.median(off[half:], 0))
+        outlying = self._outlying(off, scales)
+        changes = _spread(mended - np.median(mended, (1, 2), keepdims=True))
+        around = cv2.medianBlur(changes, _NEAR)
+        # a stuck pixel keeps its value whatever its neighbours do, and seldom has theirs: those of
+        # a saturated picture keep theirs, too
+        apart = (np.abs(off) > self.stuck * around).mean(0) >= self.apart
+        stuck = (_spread(whole) < self.stuck * around) & apart
+        # bad ones beside it may have made a good one an outlier: good ones alone are to say so
+        mended = np.stack([filled(f, bad | stuck | outlying) for f in whole])
+        alone = self._outlying(np.where(np.isnan(mended), off, whole - mended), scales)
+        return np.asarray(stuck | (outlying & alone))
+
     def _outlying(self, off: NDArray[np.float32], scales: tuple[float, float]) -> Mask:
-        """(h, w) which pixels are off (n, h, w) their neighbours to the same side in nearly all frames
-        and far off in either half of them; `scales`: the standard deviation of all in each half.
+        """(h, w) which pixels are off (n, h, w) their neighbours to the same side in nearly all
+        frames, and far off in either half; `scales`: the standard deviation of all in each half.
         """
         half = len(off) // 2
         first, second = np.median(off[:half], 0), np.median(off[half:], 0)
@@ -134,15 +144,9 @@ class FindFaults:
 
     def _thin(self, bad: Mask) -> Mask:
         """Without areas that contain squares."""
-        core = cv2.erode(bad.astype(np.uint8), np.ones((self.thick, self.thick), np.uint8))
-        if not core.any():
-            return bad
-        number, label = cv2.connectedComponents(bad.astype(np.uint8), connectivity=8)
-        thick = np.zeros(number, bool)
-        # the square lies around its anchor
-        wide = cv2.dilate(core, np.ones((self.thick, self.thick), np.uint8)) > 0
-        thick[np.unique(label[wide & bad])] = True
-        return bad & ~thick[label]
+        square = np.ones((self.thick, self.thick), np.uint8)
+        thick = cv2.dilate(cv2.morphologyEx(bad.astype(np.uint8), cv2.MORPH_OPEN, square), _BESIDE)
+        return np.asarray(bad & (thick == 0))
 
     def _lines(self, frames: Sequence[Values]) -> NDArray[np.float32]:
         """(w,) what is to be taken off each column; 0 where they do not differ for certain."""
@@ -165,7 +169,7 @@ class FindFaults:
         found = np.median(parts, 0)
         if np.corrcoef(found[1:], found[:-1])[0, 1] > self.smooth:
             return np.zeros(width, np.float32)
-        # what changes slowly along the picture is the ground's, or a pattern (`ortho.frame_pattern`)
+        # slow changes are the ground's, or those of a pattern (`ortho.frame_pattern`)
         return np.asarray(found - cv2.GaussianBlur(found[None], (0, 0), _SLOW)[0], np.float32)
 
 
@@ -257,12 +261,13 @@ def _sentence(photo: Photo, faults: DetectorFaults) -> str:
     if len(faults.bad):
         share = 100 * len(faults.bad) / (photo.width * photo.height)
         told.append(
-            f"{len(faults.bad)} pixels of its detector are dead, stuck or far off ({share:.2g} %), and"
+            f"{len(faults.bad)} pixels of its detector ({share:.2g} %) are dead, stuck or far off;"
             " their values are taken from the pixels around them"
         )
     for what, lines in (("columns", faults.columns), ("rows", faults.rows)):
         if lines.any():
             told.append(
-                f"{what} of it differ by up to {float(np.abs(lines).max()):.2g} {unit}, which is taken off"
+                f"{what} of it are off by up to {float(np.abs(lines).max()):.2g} {unit}, which is"
+                " taken off"
             )
     return f"Thermal camera {photo.camera_key}: {'; '.join(told)}."

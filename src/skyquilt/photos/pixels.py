@@ -142,8 +142,9 @@ def _decode(photo: Photo, reduction: Reduction, *, gray: bool) -> Pixels:
 
 def _mended(frame: Pixels, photo: Photo) -> Pixels:
     """A thermal frame without the faults that its detector is known to have."""
-    known = photo.faults is not None and frame.shape == (photo.height, photo.width)
-    return repaired(frame, photo.faults) if photo.faults is not None and known else frame
+    if photo.faults is None or frame.shape != (photo.height, photo.width):
+        return frame
+    return repaired(frame, photo.faults)
 
 
 def _same_size(found: tuple[int, ...], stated: tuple[int, int]) -> None:

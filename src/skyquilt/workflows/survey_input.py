@@ -130,8 +130,9 @@ def read_input(
         read=read,
     )
     survey = of_one_band(survey, settings.band)
-    photos, faults = Repair()(survey.photos, read_color)
-    survey = replace(survey, photos=photos, notes=(*survey.notes, *faults))
+    if any(p.unit for p in survey.photos):
+        photos, faults = Repair()(survey.photos, read_color)
+        survey = replace(survey, photos=photos, notes=(*survey.notes, *faults))
     shutter = stated_shutter(settings.shutter, settings.shutter_readout_ms)
     if shutter is not None:
         survey = replace(
