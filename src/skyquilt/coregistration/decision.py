@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.coregistration.agreement import Agree, Agreement, Shifts
+from skyquilt.coregistration.bent import Bending
 from skyquilt.coregistration.error_field import FREE, Scatter, StateError, overlap_corners
 from skyquilt.coregistration.orientation import (
     BLUR,
@@ -46,6 +47,8 @@ class Decide:
     """
     repeats: Repeats = field(default_factory=Repeats)
     """The comparison with places further away."""
+    bent: Bending = field(default_factory=Bending)
+    """Whether a lens bends one of the pictures."""
     gain: float = 0.02
     """Relative gain in correlation required for a homography instead of a similarity."""
     determined: float = 3.0
@@ -64,7 +67,7 @@ class Decide:
     """Weight of finer structure, the rest is that of coarser one. Alone it is the more exact where
     the bands are alike, and the less exact where they are not, and its error is less certain.
     """
-    version: ClassVar[int] = 5
+    version: ClassVar[int] = 6
 
     def __call__(
         self, pyramid: Pyramid, fits: Sequence[Fit], reach: float = float("inf")
@@ -93,8 +96,10 @@ class Decide:
             )
         return self._finished(pyramid, fit, agreement)
 
-    def _finished(self, pyramid: Pyramid, fit: Fit, agreement: Agreement) -> Registration:
-        """The registration with the model that the images support, in px of the images."""
+    def _finished(self, pyramid: Pyramid, fit: Fit, agreement: Agreement) -> Outcome:
+        """The registration with the model that the images support, in px of the images; refused
+        where none can fit.
+        """
         a, b = pyramid.at(pyramid.last)
         model: Freedom = "similarity"
         corners = overlap_corners(fit.b_H_a, a.shape, b.shape)
@@ -107,6 +112,16 @@ class Decide:
                 agreement = self.agree(a, b, fit.b_H_a)
         full, error = self._closer(pyramid, fit, model)
         to_full = np.linalg.inv(b.small_S_full)
+        found = between(a, b, full)
+        apart = self.bent(
+            self.agree.shifts(a, b, found), b.shape, overlap_corners(found, a.shape, b.shape)
+        )
+        if apart is not None:
+            return RefusedRegistration(
+                reason=_is_bent(apart * float(to_full[0, 0])),
+                inliers=len(agreement.px),
+                evidence=_evidence(agreement, fit),
+            )
         return Registration(
             model=model,
             b_H_a=full,
@@ -173,6 +188,14 @@ def _doubt(agreement: Agreement, least: float) -> str:
         f"the best position found is not confirmed: {len(agreement.px)} of {agreement.patches}"
         " patches agree with"
         f" it, significance 10^-{agreement.surprise:.1f}; 10^-{least:g} is required"
+    )
+
+
+def _is_bent(apart: float) -> str:
+    return (
+        "one of the pictures is bent by its lens (barrel or cushion distortion), and no"
+        f" registration follows it: at a corner it would be {apart:.0f} px of B off; take the"
+        " distortion out of the pictures first"
     )
 
 

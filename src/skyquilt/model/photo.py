@@ -5,6 +5,9 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from skyquilt import registry
 from skyquilt.model.camera import Camera
 
@@ -110,6 +113,20 @@ UNKNOWN_SHUTTER = Shutter(readout_s=0.0, sigma_s=0.0, source="unknown")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class DetectorFaults:
+    """What is wrong with a thermal camera's detector, in every frame of a flight."""
+
+    bad: NDArray[np.int32]
+    """(n,) pixels that do not measure, counted along rows."""
+    columns: NDArray[np.float32]
+    """(w,) by how much columns are too warm, in the frames' unit."""
+    rows: NDArray[np.float32]
+    """(h,) the same of rows."""
+    key: str
+    """Hash of the above (hex)."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Photo:
     """One photo: where its pixels are and what its metadata report."""
 
@@ -139,6 +156,8 @@ class Photo:
     """What a single-band pixel value means; empty for pictures."""
     stored: Stored = ""
     """What a value of a thermal TIFF means as stored in the file; empty for other files."""
+    faults: DetectorFaults | None = None
+    """Faults of its detector, mended when its pixels are read; None where none are known."""
     camera_key: str
     """Photos with equal keys share their intrinsics: make, model, serial, lens, size, zoom."""
     calibration: Camera | None = None
@@ -185,6 +204,11 @@ class Photo:
     """How a JPEG is coded (`photos.headers.JpegHeader.coding`); empty for other files."""
     frame_s: float | None = None
     """Time in s of the frame in the clip that `path` is; None where `path` is a photo."""
+
+    @property
+    def pixels_key(self) -> str:
+        """Stands for its pixels as they are read: the digest of its file, and what is mended."""
+        return self.digest if self.faults is None else f"{self.digest}-{self.faults.key}"
 
     @property
     def shows_a_band(self) -> bool:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from skyquilt.errors import UnreadablePhotoError
 from skyquilt.model.photo import Photo
 from skyquilt.outside import open_regular
+from skyquilt.photos.detector_faults import repaired
 from skyquilt.photos.headers import content_digest, read_header
 from skyquilt.photos.tags import MAKE
 from skyquilt.photos.thermal import thermal_frame_of_jpeg, thermal_frame_of_values
@@ -122,7 +123,7 @@ def _decode(photo: Photo, reduction: Reduction, *, gray: bool) -> Pixels:
         head = file.read(4)
         file.seek(0)
         if head[:2] == b"\xff\xd8" and photo.unit:
-            return reduce_pixels(_thermal_jpeg(photo.path), reduction)
+            return reduce_pixels(_mended(_thermal_jpeg(photo.path), photo), reduction)
         if head[:2] == b"\xff\xd8":
             data = file.read()
             _same_size(simplejpeg.decode_jpeg_header(data)[1::-1], size)
@@ -134,9 +135,16 @@ def _decode(photo: Photo, reduction: Reduction, *, gray: bool) -> Pixels:
         pixels = pixels[..., 0]
     elif photo.channels == 3 and pixels.shape[2] == 1:  # grey among photos in colour
         pixels = np.repeat(pixels, 3, axis=2)
-    return reduce_pixels(
-        thermal_frame_of_values(pixels, photo.stored).values if photo.unit else pixels, reduction
-    )
+    if photo.unit:
+        pixels = _mended(thermal_frame_of_values(pixels, photo.stored).values, photo)
+    return reduce_pixels(pixels, reduction)
+
+
+def _mended(frame: Pixels, photo: Photo) -> Pixels:
+    """A thermal frame without the faults that its detector is known to have."""
+    if photo.faults is None or frame.shape != (photo.height, photo.width):
+        return frame
+    return repaired(frame, photo.faults)
 
 
 def _same_size(found: tuple[int, ...], stated: tuple[int, int]) -> None:

@@ -19,14 +19,14 @@ from skyquilt.workflows.second_look import connect
 def photo_key(photo: Photo) -> str:
     """Content and metadata of a photo."""
     return digest(
-        photo.name, photo.digest, photo.position, photo.attitude, photo.focal, photo.calibration
+        photo.name, photo.pixels_key, photo.position, photo.attitude, photo.focal, photo.calibration
     )
 
 
 def alignment_key(known: AlignmentInputs, methods: Methods, earlier: str = "") -> str:
     """Key of an alignment; `earlier`: of the map that it continues."""
     photos = [
-        (p.digest, p.name, p.camera_key, p.focal, p.calibration, p.shown_lens, p.editor)
+        (p.pixels_key, p.name, p.camera_key, p.focal, p.calibration, p.shown_lens, p.editor)
         for p in known.photos
     ]
     moving = [(p.shutter, p.velocity_ned, p.time and p.time.isoformat()) for p in known.photos]
@@ -63,7 +63,7 @@ def exposure_key(
         methods.balance,
         methods.drift,
         Levelling,
-        [p.digest for p in photos],
+        [p.pixels_key for p in photos],
         *_growth(ground),
     )
 
@@ -84,7 +84,7 @@ def labels_key(
         dict(exposure.fields),
         methods.seams,
         picture_recipe(),
-        [p.digest for p in photos],
+        [p.pixels_key for p in photos],
         *([(i, m.room) for i, m in sorted(ground.limits.marks.items())]),
         *_growth(ground),
     )

@@ -243,7 +243,7 @@ class _Linker:
 
 def seen_as(photo: Photo) -> object:
     """What of a photo enters its links: its content, and its lens if that is a fisheye."""
-    return (photo.digest, photo.lens) if photo.lens.fisheye else photo.digest
+    return (photo.pixels_key, photo.lens) if photo.lens.fisheye else photo.pixels_key
 
 
 def of_unknown_kind(photos: Sequence[Photo]) -> dict[str, Camera]:

@@ -233,7 +233,7 @@ def pixels_of(photo: Photo, store: Store) -> NDArray[Any]:
 
 def features_key(photo: Photo, detector: Detector) -> str:
     """The key of a photo's features and thumbnail in the store."""
-    return digest(photo.digest, features_recipe(detector))
+    return digest(photo.pixels_key, features_recipe(detector))
 
 
 def features_recipe(detector: Detector) -> tuple[Any, ...]:
@@ -243,7 +243,7 @@ def features_recipe(detector: Detector) -> tuple[Any, ...]:
 
 def picture_key(photo: Photo) -> str:
     """The key of a photo's grey image in the store."""
-    return digest(photo.digest, picture_recipe())
+    return digest(photo.pixels_key, picture_recipe())
 
 
 def picture_recipe() -> tuple[Any, ...]:

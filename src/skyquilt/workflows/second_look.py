@@ -66,7 +66,7 @@ class CloserLook:
     def __call__(self, photo: int) -> Features:
         """Features of a photo (index)."""
         detector, one = self.methods.detector, self.photos[photo]
-        key = digest(one.digest, "closer", features_recipe(detector))
+        key = digest(one.pixels_key, "closer", features_recipe(detector))
 
         def found() -> Features:
             small, _ = shrink(self.grey(photo, PICTURE), detector.longest)

@@ -16,11 +16,12 @@ from skyquilt.model.photo import (
     Survey,
 )
 from skyquilt.outside import same_folder
+from skyquilt.photos.detector_faults import Repair
 from skyquilt.photos.distances import read_distances
 from skyquilt.photos.gcp import check_control, read_gcp_list
 from skyquilt.photos.left_out import of_one_band
 from skyquilt.photos.lever_arm import with_lever_arm
-from skyquilt.photos.pixels import lost
+from skyquilt.photos.pixels import lost, read_color
 from skyquilt.photos.read import ReadPhoto, read_photo
 from skyquilt.photos.sequence import sequence_of
 from skyquilt.photos.shutter import stated_shutter
@@ -129,6 +130,9 @@ def read_input(
         read=read,
     )
     survey = of_one_band(survey, settings.band)
+    if any(p.unit for p in survey.photos):
+        photos, faults = Repair()(survey.photos, read_color)
+        survey = replace(survey, photos=photos, notes=(*survey.notes, *faults))
     shutter = stated_shutter(settings.shutter, settings.shutter_readout_ms)
     if shutter is not None:
         survey = replace(
