@@ -42,6 +42,10 @@ AllowHost = Annotated[
         show_default="the address, the machine's name",
     ),
 ]
+PublicUrl = Annotated[
+    str | None,
+    typer.Option(help="Address under which a reverse proxy shows the server: https://host/map/."),
+]
 MaxConnections = Annotated[int, typer.Option(min=4, max=900, help="Connections from one address.")]
 
 
@@ -128,6 +132,7 @@ def command(
         typer.Option(min=0.3, help="Resident memory in GB at which the viewer is started anew."),
     ] = 1.5,
     allow_host: AllowHost = None,
+    public_url: PublicUrl = None,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -173,6 +178,7 @@ def command(
         host=host,
         token=token,
         allow_hosts=tuple(allow_host or ()),
+        public_url=public_url,
         most_connections=max_connections,
     )
     for folder in inbox:

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from skyquilt.cli.interrupt import ends_at_once
-from skyquilt.cli.live import AllowHost, Host, MaxConnections, Port, Token
+from skyquilt.cli.live import AllowHost, Host, MaxConnections, Port, PublicUrl, Token
 from skyquilt.cli.options import MaxMemory
 from skyquilt.outside import plain
 
@@ -32,6 +32,7 @@ def command(
         ),
     ] = None,
     allow_host: AllowHost = None,
+    public_url: PublicUrl = None,
     max_connections: MaxConnections = 200,
     max_memory: MaxMemory = None,
 ) -> None:
@@ -45,6 +46,7 @@ def command(
         host=host,
         token=token,
         allow_hosts=tuple(allow_host or ()),
+        public_url=public_url,
         most_connections=max_connections,
     )
     survey = open_survey(folder, base=base, photos=photos)

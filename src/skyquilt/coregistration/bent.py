@@ -24,7 +24,7 @@ class Bending:
     pairs reached 1.4, and less than this in 102 variations of them. With a barrel distortion of 15
     or 20 % in one of the pictures wrong ones reached 3.5 at least, with one of 30 % 1.9.
     """
-    harmful: float = 0.02
+    harmful: float = 0.025
     """Departure at a corner that is too much, as a share of the picture's diagonal."""
     scale: float = 1.5
     """Residual in px at which a patch weighs a quarter."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Protocol
+from urllib.parse import urlsplit
 
 from fastapi import HTTPException, Request
 from fastapi.responses import JSONResponse
@@ -22,6 +23,7 @@ from skyquilt.engine.error_log import log_error
 from skyquilt.errors import OutputError, UsageError
 from skyquilt.live.ledger import Ledger
 from skyquilt.live.photo_intake import Intake
+from skyquilt.outside import plain
 from skyquilt.raster.map_source import MapSource
 from skyquilt.server.shown import Survey
 
@@ -68,6 +70,10 @@ class Guard:
     """Largest number of connections from one address."""
     allow_hosts: tuple[str, ...] = ()
     """Further names under which clients may address the server."""
+    public_url: str | None = None
+    """Address under which a reverse proxy shows the server, `https://host/path/`; None = there is
+    none.
+    """
     upload_stall_s: float = 10.0
     """If no data arrive for this time in s, the connection of an upload counts as lost."""
     upload_empty_s: float = 600.0
@@ -86,6 +92,17 @@ class Guard:
             )
         if self.token is not None and len(self.token) < 8:
             raise UsageError(f"--token has {len(self.token)} characters; use at least 8")
+        if self.public_url is not None:
+            _check_public(self.public_url)
+
+    @property
+    def public_host(self) -> str:
+        """Host, and port if given, of the public address; empty if there is none."""
+        return urlsplit(self.public_url).netloc.lower() if self.public_url else ""
+
+    def base(self, request: Request) -> str:
+        """The address under which clients reach the server, with a slash at its end."""
+        return (self.public_url or str(request.base_url)).rstrip("/") + "/"
 
     def admits(self, given: str | None) -> bool:
         """Whether a request may write: its header `Authorization: Bearer ...` or `X-Token` contains
@@ -102,7 +119,8 @@ class Guard:
         """
         name = host_header.rsplit(":", 1)[0] if not host_header.endswith("]") else host_header
         name = name.strip("[]").rstrip(".").lower()
-        if local(name) or name in {n.lower() for n in self.allow_hosts}:
+        public = urlsplit(f"//{self.public_host}").hostname
+        if local(name) or name == public or name in {n.lower() for n in self.allow_hosts}:
             return True
         if local(self.host):
             return False
@@ -113,6 +131,21 @@ class Guard:
         except ValueError:
             return False
         return self.host in ("0.0.0.0", "::", "")
+
+
+def _check_public(url: str) -> None:
+    """Raises `UsageError` where an address is none that a reverse proxy can have."""
+    try:
+        parts = urlsplit(url)
+        usual = parts.scheme in ("http", "https") and parts.hostname and parts.port != 0
+    except ValueError:
+        usual, parts = False, urlsplit("")
+    strange = parts.query or parts.fragment or "@" in parts.netloc or not url.isprintable()
+    if not usual or strange or set(url) & set(' "<>{}\\'):
+        raise UsageError(
+            f"--public-url {plain(url, 80)!r} is no address under which a reverse proxy shows a"
+            " map, such as https://host/map/"
+        )
 
 
 @cache
@@ -284,5 +317,8 @@ class Context:
                 {"WWW-Authenticate": "Bearer"},
             )
         origin = request.headers.get("origin")
-        if origin is not None and origin.split("://")[-1] != request.headers.get("host", ""):
+        if origin is None:
+            return
+        own = {request.headers.get("host", ""), self.guard.public_host} - {""}
+        if origin.split("://")[-1].lower() not in {name.lower() for name in own}:
             raise HTTPException(403, "pages of other sites may not write here")

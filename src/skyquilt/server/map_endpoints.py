@@ -133,7 +133,7 @@ class MapEndpoints:
             "scheme": "xyz",
             "minzoom": 0,
             "maxzoom": 24,
-            "tiles": [f"{request.base_url}tiles/{{z}}/{{x}}/{{y}}?layer={name}"],
+            "tiles": [f"{self.context.guard.base(request)}tiles/{{z}}/{{x}}/{{y}}?layer={name}"],
             **({"bounds": box} if box else {}),
         }
 

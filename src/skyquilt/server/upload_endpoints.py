@@ -92,7 +92,10 @@ class UploadEndpoints:
         _check_size(size, most, f"such a file may have {most} bytes", {"Tus-Max-Size": str(most)})
         source = about.get("source") or "upload"
         upload = self._begun(name, source, size, client_of(request), metadata)
-        told = {"Location": f"{RESUMABLE}/{upload.id}", **self._progress(upload)}
+        at = f"{RESUMABLE}/{upload.id}"
+        if self.context.guard.public_url:  # else clients find it on the host that they asked
+            at = self.context.guard.base(request) + at.lstrip("/")
+        told = {"Location": at, **self._progress(upload)}
         return Response(status_code=201, headers=told)
 
     async def upload_state(self, request: Request, number: str) -> Response:

@@ -46,7 +46,8 @@ class WmsEndpoints:
             if what in ("getcapabilities", "capabilities"):
                 kind = "application/vnd.ogc.wms_xml" if version.startswith("1.1") else "text/xml"
                 return Response(
-                    capabilities(known, f"{request.base_url}wms?", version), media_type=kind
+                    capabilities(known, f"{self.context.guard.base(request)}wms?", version),
+                    media_type=kind,
                 )
             if what in ("getmap", "map"):
                 return self._map(query, version)
