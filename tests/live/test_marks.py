@@ -8,8 +8,10 @@ import pytest
 from PIL import Image
 
 from skyquilt.live.live_map import LiveMap
-from skyquilt.live.marks import LOOKED
+from skyquilt.live.marks import LOOKED, LiveMarks
 from skyquilt.live.settings import LiveSettings
+from skyquilt.live.tile_drawing import WHOLE
+from skyquilt.ortho.blend import Feather
 from skyquilt.simulate.settings import Control, Route
 from tests.live.conftest import fed, made, offsets
 
@@ -48,6 +50,12 @@ def rms(live, flight):
     return np.sqrt((offsets(live, flight)[:, :2] ** 2).mean(0)).max()
 
 
+def white(live):
+    """Share of the map that is white as letters are."""
+    tiles = [live.tiles.get(a) for a in live.tiles.addresses("visible", 0)]
+    return np.concatenate([t.pixels.min(-1)[t.shown] > 200 for t in tiles]).mean()
+
+
 def test_a_text_in_every_picture_moves_nothing(plain, stamped, tmp_path):
     """Without marks it moves photos by 16 m. Positions scatter by 2 m."""
     one = fed(opened(tmp_path / "plain"), plain.photos)
@@ -61,6 +69,34 @@ def test_a_text_in_every_picture_moves_nothing(plain, stamped, tmp_path):
     finally:
         one.close()
         live.close()
+
+
+def test_a_text_is_drawn_only_where_nothing_else_is(plain, stamped, tmp_path, monkeypatch):
+    """It is found when some photos are drawn already: their tiles are drawn again."""
+    live = fed(opened(tmp_path / "out", deterministic=True), stamped)
+    monkeypatch.setattr(LiveMarks, "shown", lambda self, camera: None)
+    maps = (
+        live,
+        fed(opened(tmp_path / "all", deterministic=True), stamped),
+        fed(opened(tmp_path / "none"), plain.photos),
+    )
+    try:
+        mended, text, without = map(white, maps)
+        assert text > without + 0.01
+        assert mended - without < 0.85 * (text - without)  # the rest lies at the rim
+        off = []
+        for address in live.tiles.addresses("visible", 0):
+            stored, compose = (
+                live.tiles.get(address),
+                live.canvas._composer(address, Feather(width_px=2.0)),
+            )
+            now = compose.drawn(compose.plan(WHOLE))
+            both = stored.shown & (now.photo >= 0)
+            off.append(np.abs(stored.pixels[both].astype(int) - now.pixels[both]).max(-1))
+        assert (np.concatenate(off) > 40).mean() < 0.02
+    finally:
+        for one in maps:
+            one.close()
 
 
 def test_a_restart_goes_on_with_the_same_marks(stamped, tmp_path):

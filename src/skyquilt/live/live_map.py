@@ -146,6 +146,7 @@ class LiveMap:
             self.members.by_id,
             self.store,
             self.settings.max_view_angle,
+            self.live_links.marks.shown,
         )
         self.canvas.gsd = float(self.ledger.meta("gsd", 0.0))
         self.canvas.ground = float(self.ledger.meta("ground", 0.0))

@@ -1,10 +1,13 @@
-"""Fixed marks of the pictures of a growing survey: a burnt-in text, a logo, dirt on the lens."""
+"""Fixed marks of the pictures of a growing survey: a burnt-in text, a logo, dirt on the lens. They
+connect no photos, and are drawn only where nothing else shows the ground.
+"""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
 
+from skyquilt.imaging.blank import Blank, Mask, marked
 from skyquilt.live.members import Member, Members
 from skyquilt.matching.fixed_marks import FindFixedMarks, FixedMarks
 from skyquilt.model.features import Features
@@ -27,6 +30,7 @@ class LiveMarks:
         self.find = FindFixedMarks()
         self.known = FixedMarks()
         self._looked = dict[str, int]()
+        self._shown = dict[str, tuple[Mask, Blank]]()
 
     def look(self, camera: str) -> bool:
         """Looks for marks in the photos of a camera (`camera_key`) that were compared so far, if it
@@ -42,6 +46,15 @@ class LiveMarks:
                 news |= self._found(camera, own[:count]) and count > told
                 self._looked[camera] = count
         return news
+
+    def shown(self, camera: str) -> Blank | None:
+        """Where photos of a camera show marks; the same object until others are found."""
+        mask = self.known.masks.get(camera)
+        if mask is None:
+            return None
+        if camera not in self._shown or not np.array_equal(self._shown[camera][0], mask):
+            self._shown[camera] = mask, marked(mask, self.known.cell_px[camera])
+        return self._shown[camera][1]
 
     def _told(self, camera: str) -> int:
         """In how many photos of a camera marks were looked for when its links were compared

@@ -45,6 +45,7 @@ class RedrawQueue:
         self._rims: dict[int, NDArray[np.float64]] = {}
         self._to_draw: set[int] = set()
         self._fresh: dict[str, list[Address]] = {}
+        self._remarked: set[int] = set()
         self._noted = whole(self.ledger.meta(WHITE, 0), 0, MOST_NOTED) or 0
         self._take_up()
 
@@ -64,6 +65,7 @@ class RedrawQueue:
 
     def show(self, member: Member) -> None:
         """Queues the tiles of a new photo as urgent."""
+        self._look_for_marks(member)
         self._to_draw.add(member.id)
         _add(self.urgent, self._placed(member), member.id)
 
@@ -81,6 +83,15 @@ class RedrawQueue:
                 self.ledger.tell("note", {"text": note if len(white) < 2 else f"So far {note}"})
         return addresses
 
+    def _look_for_marks(self, member: Member) -> None:
+        """Notes that all photos of a photo's camera look different if marks were found on them."""
+        camera = member.photo.camera_key
+        if self.canvas.remarked(camera):
+            for other in self.members.on_map():
+                if other.photo.camera_key == camera:
+                    self._remarked.add(other.id)
+                    self.changed(other)
+
     def changed(self, member: Member) -> None:
         """Notes that a photo looks different; its tiles are determined later."""
         self._to_draw.add(member.id)
@@ -88,6 +99,7 @@ class RedrawQueue:
 
     def moved(self, member: Member) -> None:
         """Notes that a photo has moved; it is drawn again if the change is visible."""
+        self._look_for_marks(member)
         drawn = self._drawn.get(member.id)
         if drawn is None or self.canvas.moved(member, drawn):
             self.changed(member)
@@ -101,7 +113,9 @@ class RedrawQueue:
             if member.state == "superseded":
                 continue
             addresses = self._placed(member)
-            if self._looks_as_drawn(number):
+            remarked = number in self._remarked
+            self._remarked.discard(number)
+            if not remarked and self._looks_as_drawn(number):
                 self._to_draw.discard(number)
             else:
                 self._to_draw.add(number)

@@ -4,8 +4,9 @@ redrawn where those have changed.
 
 import os
 from collections import OrderedDict, defaultdict
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.store import Store
 from skyquilt.engine.workers import Threads
-from skyquilt.imaging.blank import Blank
+from skyquilt.imaging.blank import Blank, joined
 from skyquilt.imaging.grey import shrink
 from skyquilt.imaging.nodes import View
 from skyquilt.imaging.view_limits import COARSEST, ViewLimits, limits_for
@@ -118,7 +119,9 @@ class Canvas:
         members: dict[int, Member],
         store: Store,
         max_view_angle: float,
+        marks: Callable[[str], Blank | None],
     ) -> None:
+        """`marks`: what the photos of a camera (its key) all show at one place of the picture."""
         self.tiles, self.heights, self.members = tiles, heights, members
         self.gsd = 0.0
         self.ground = 0.0
@@ -133,6 +136,8 @@ class Canvas:
         self._by_tile: dict[Address, set[int]] = defaultdict(set)
         self._pictures = SmallPictures(full, members, store)
         self._white: dict[int, Blank | None] = {}
+        self._marks = marks
+        self._marked: dict[str, Blank | None] = {}
         self._tone = Tone(self._pictures)
 
     def place(self, member: Member, camera: Camera) -> set[Address]:
@@ -204,8 +209,11 @@ class Canvas:
         surface = self.surface((x - reach, y - reach, x + reach, y + reach))
         self._sizes[member.id] = abs(z - self.ground) / camera.focal
         limits = self._limits(small, pose, surface)
-        if (white := self._overexposed(member, (w, h))) is not None:
-            limits = replace(limits, mark=white)
+        fixed = self._marks(member.photo.camera_key)
+        bad = [replace(fixed, size=(w, h))] if fixed is not None else []
+        bad += [white] if (white := self._overexposed(member, (w, h))) is not None else []
+        if bad:
+            limits = replace(limits, mark=reduce(joined, bad))
         outline = footprint(small, pose, surface, limits=limits)
         return (
             View(photo=member.id, camera=small, pose=pose, footprint=outline, limits=limits)
@@ -221,6 +229,12 @@ class Canvas:
             small = shrink(self._pictures(member.id), LOOKED_AT)[0]
             self._white[member.id] = overexposed(small, size)
         return self._white[member.id]
+
+    def remarked(self, camera: str) -> bool:
+        """Whether marks were found on the pictures of a camera (its key) since this was asked."""
+        now, before = self._marks(camera), self._marked.get(camera)
+        self._marked[camera] = now
+        return now is not before
 
     def is_white(self, number: int) -> bool:
         """Whether a photo is on the map and overexposed in part."""

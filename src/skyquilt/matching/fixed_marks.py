@@ -47,7 +47,7 @@ class FixedMarks:
             f"Photos of {camera} show the same marks at the same place in every picture, on"
             f" {100 * mask.mean():.1f} % of it: a text or logo written into them, a frame, or dirt"
             " on the lens. They are not used to connect photos, and are drawn only where no other"
-            " photo shows the ground (on the live map everywhere)."
+            " photo shows the ground."
             for camera, mask in self.masks.items()
         )
 
