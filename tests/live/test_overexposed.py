@@ -15,6 +15,7 @@ from skyquilt.ortho.blend import Feather
 from skyquilt.simulate.settings import Control, Route
 from tests.live.conftest import fed, made
 
+pytestmark = pytest.mark.slow
 SPOILT = (1, 4)
 """Photos that are overexposed, of eight in two lines."""
 
