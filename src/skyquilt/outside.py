@@ -208,9 +208,9 @@ def walk(
     top: Path, unread: Callable[[Path, OSError], None] | None = None
 ) -> Iterator[tuple[Path, list[str], list[str]]]:
     """Folders below `top`, each with the names of its subfolders, from which the caller may remove
-    some, and of its other files, both sorted. Links to folders are not followed; folders that
-    cannot be read count as empty, and `unread` is told of them. Unlike `os.walk` it takes any
-    depth.
+    some, and of its other files, both sorted. Hidden folders are named, not entered. Links to
+    folders are not followed; folders that cannot be read count as empty, and `unread` is told of
+    them. Unlike `os.walk` it takes any depth.
     """
     waiting = [top]
     while waiting:
@@ -224,7 +224,7 @@ def walk(
             continue
         folders = sorted(name for name, folder in entries if folder)
         yield here, folders, sorted(name for name, folder in entries if not folder)
-        waiting += [here / name for name in reversed(folders)]
+        waiting += [here / name for name in reversed(folders) if not hidden(name)]
 
 
 def check_picture(

@@ -82,18 +82,10 @@ class Decide:
             )
         agreement, fit = max(judged, key=lambda j: j[0].surprise)
         if agreement.surprise < self.least_surprise:
-            return RefusedRegistration(
-                reason=_doubt(agreement, self.least_surprise),
-                inliers=len(agreement.px),
-                evidence=_evidence(agreement, fit),
-            )
+            return _refused(_doubt(agreement, self.least_surprise), agreement, fit)
         rival = self.repeats(*pyramid.at(pyramid.last), fit.b_H_a, self.agree)
         if rival is not None and np.hypot(*rival.shift) <= reach:
-            return RefusedRegistration(
-                reason=_repeated(rival, pyramid),
-                inliers=len(agreement.px),
-                evidence=_evidence(agreement, fit),
-            )
+            return _refused(_repeated(rival, pyramid), agreement, fit)
         return self._finished(pyramid, fit, agreement)
 
     def _finished(self, pyramid: Pyramid, fit: Fit, agreement: Agreement) -> Outcome:
@@ -117,11 +109,7 @@ class Decide:
             self.agree.shifts(a, b, found), b.shape, overlap_corners(found, a.shape, b.shape)
         )
         if apart is not None:
-            return RefusedRegistration(
-                reason=_is_bent(apart * float(to_full[0, 0])),
-                inliers=len(agreement.px),
-                evidence=_evidence(agreement, fit),
-            )
+            return _refused(_is_bent(apart * float(to_full[0, 0])), agreement, fit)
         return Registration(
             model=model,
             b_H_a=full,
@@ -181,6 +169,12 @@ def _evidence(agreement: Agreement, fit: Fit) -> dict[str, float]:
         "patches_agreeing": float(len(agreement.px)),
         "correlation": round(fit.correlation, 4),
     }
+
+
+def _refused(reason: str, agreement: Agreement, fit: Fit) -> RefusedRegistration:
+    return RefusedRegistration(
+        reason=reason, inliers=len(agreement.px), evidence=_evidence(agreement, fit)
+    )
 
 
 def _doubt(agreement: Agreement, least: float) -> str:

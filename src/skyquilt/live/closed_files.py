@@ -8,7 +8,7 @@ import struct
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from skyquilt.outside import hidden, is_folder, walk
+from skyquilt.outside import is_folder, walk
 
 CLOSE_WRITE, MOVED_TO, CREATE, IS_DIR, OVERFLOW = 0x8, 0x80, 0x100, 0x40000000, 0x4000
 IGNORED = 0x8000
@@ -40,8 +40,7 @@ class ClosedFiles:
         more watches.
         """
         every = True
-        for here, folders, _ in walk(Path(folder)):
-            folders[:] = [f for f in folders if not hidden(f)]
+        for here, _, _ in walk(Path(folder)):
             number = self._libc.inotify_add_watch(
                 self._handle, os.fsencode(here), CLOSE_WRITE | MOVED_TO | CREATE
             )

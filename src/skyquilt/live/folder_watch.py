@@ -200,7 +200,6 @@ class Watch:
             if here != self.folder and not RUN_MARKS.isdisjoint((*names, *folders)):
                 folders.clear()
                 continue
-            folders[:] = [f for f in folders if not hidden(f)]
             yield from (here / name for name in names if _photo_name(name))
 
     def _of_a_run(self, path: Path) -> bool:
@@ -248,7 +247,7 @@ def _stored(key: str) -> str:
 def _photo_name(name: str) -> bool:
     low = name.lower()
     taken = low.endswith(PHOTO_ENDINGS) or is_clip(Path(low))
-    return not low.startswith(".") and taken and not low.endswith(PARTIAL)
+    return not hidden(low) and taken and not low.endswith(PARTIAL)
 
 
 def _stamp(path: Path) -> Stamp | None:

@@ -11,6 +11,7 @@ from skyquilt.imaging.blank import Blank, Mask, marked
 from skyquilt.live.members import Member, Members
 from skyquilt.matching.fixed_marks import FindFixedMarks, FixedMarks
 from skyquilt.model.features import Features
+from skyquilt.model.photo import evenly
 from skyquilt.outside import whole
 
 LOOKED = "marks"
@@ -79,8 +80,7 @@ class LiveMarks:
 
     def _found(self, camera: str, photos: list[Member]) -> bool:
         """Whether some of these photos show marks that were not known."""
-        spread = np.unique(np.linspace(0, len(photos) - 1, self.find.looked_at).round().astype(int))
-        some = [photos[k] for k in spread.tolist()]
+        some = [photos[k] for k in evenly(len(photos), self.find.looked_at)]
         sizes = [(m.photo.width, m.photo.height) for m in some]
         found = self.find([self.features(m.id) for m in some], [camera] * len(some), sizes)
         mask, known = found.masks.get(camera), self.known.masks.get(camera)

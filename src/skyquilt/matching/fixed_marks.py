@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from skyquilt.imaging.blank import Blank, marked
 from skyquilt.model.features import Features
+from skyquilt.model.photo import evenly
 
 Mask = NDArray[np.bool_]
 
@@ -91,8 +92,7 @@ class FindFixedMarks:
             own = [i for i, c in enumerate(cameras) if c == camera]
             if len(own) < self.fewest:
                 continue
-            spread = np.unique(np.linspace(0, len(own) - 1, self.looked_at).round().astype(int))
-            some = [features[own[k]] for k in spread.tolist()]
+            some = [features[own[k]] for k in evenly(len(own), self.looked_at)]
             side = self.cell_px * some[0].scale
             width, height = sizes[own[0]]
             mask = np.zeros((int(height / side) + 1, int(width / side) + 1), bool)

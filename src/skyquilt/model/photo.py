@@ -112,6 +112,12 @@ class Shutter:
 UNKNOWN_SHUTTER = Shutter(readout_s=0.0, sigma_s=0.0, source="unknown")
 
 
+def evenly(number: int, most: int) -> list[int]:
+    """Indices of at most `most` of a number of photos, spread evenly from the first to the last."""
+    spread = np.linspace(0, number - 1, most).round().astype(int)
+    return [int(k) for k in np.unique(spread)]
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DetectorFaults:
     """What is wrong with a thermal camera's detector, in every frame of a flight."""

@@ -11,7 +11,7 @@ import numpy as np
 from skyquilt.errors import SideFileError
 from skyquilt.model.clip import ChosenFrames, Clip, Track
 from skyquilt.model.photo import Photo, RejectedPhoto
-from skyquilt.outside import PHOTO_ENDINGS, hidden
+from skyquilt.outside import PHOTO_ENDINGS, hidden, walk
 from skyquilt.photos.kept_frames import KEPT_QUALITY
 from skyquilt.photos.read import read_photo
 from skyquilt.photos.video_modes import with_mode
@@ -59,7 +59,12 @@ def track_in_folder(folder: Path, clip: Path) -> Track:
 
     Raises `SideFileError` where there are none.
     """
-    files = sorted(p for p in folder.rglob("*") if p.is_file() and not hidden(p.name))
+    files = sorted(
+        p
+        for here, _, names in walk(folder)
+        for name in names
+        if not hidden(name) and (p := here / name).is_file()
+    )
     timed = [
         p
         for p in files

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from skyquilt.engine.store import digest
 from skyquilt.errors import UnreadablePhotoError
-from skyquilt.model.photo import DetectorFaults, Photo
+from skyquilt.model.photo import DetectorFaults, Photo, evenly
 
 Values = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -234,9 +234,8 @@ class Repair:
         for kind, own in kinds.items():
             if len(own) < self.find.fewest:
                 continue
-            some = np.unique(np.linspace(0, len(own) - 1, self.find.looked_at).round().astype(int))
             frames = []
-            for k in some.tolist():
+            for k in evenly(len(own), self.find.looked_at):
                 try:
                     frames.append(read(own[k]))
                 except UnreadablePhotoError:  # it is left out by name when features are sought

@@ -102,7 +102,6 @@ def _walk(
             runs.append(_text(here.relative_to(top).as_posix()))
             folders.clear()
             continue
-        folders[:] = [f for f in folders if not hidden(f)]
         yield from (here / f for f in files if not hidden(f))
 
 
