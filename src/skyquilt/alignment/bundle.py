@@ -19,7 +19,7 @@ from skyquilt.alignment.oblique_guess import LOWERED, guessed_priors, lowered
 from skyquilt.alignment.oblique_start import reported_start, slanting
 from skyquilt.alignment.outcome import accuracy, ground_points, leave_one_out, misfits, undetermined
 from skyquilt.alignment.problem import Problem, State
-from skyquilt.alignment.repairs import Beginning, Survey, begun_with, repaired
+from skyquilt.alignment.repairs import Beginning, Survey, Tried, begun_with, repaired
 from skyquilt.alignment.setup import Setup, camera_records, pose_records, priors_by_camera, set_up
 from skyquilt.alignment.stages import (
     believe_positions,
@@ -32,7 +32,13 @@ from skyquilt.alignment.stages import (
 from skyquilt.alignment.start import Start, find_start, ground_of
 from skyquilt.alignment.tracks import Thinning, Tracks, build_tracks, thin
 from skyquilt.alignment.triangulate import triangulated
-from skyquilt.alignment.unfit_cameras import loosened, unfit_cameras
+from skyquilt.alignment.unfit_cameras import (
+    CameraPriors,
+    cut_cameras,
+    loosened,
+    uncentred,
+    unfit_cameras,
+)
 from skyquilt.alignment.upside_down import turned_note, upside_down
 from skyquilt.engine.free_memory import give_back
 from skyquilt.engine.kept import MADE_NOW, Keep
@@ -111,15 +117,17 @@ class Bundle:
         def guess(begun: Beginning) -> Sequence[Prior] | None:
             return guessed_priors(enlarged(begun), begun.priors, features, links)
 
+        def priors_of(tried: Tried) -> CameraPriors:
+            return priors_by_camera(enlarged(tried.begun), self.distortion)
+
         survey = Survey(
             names=[p.name for p in photos],
             cameras=[p.camera_key for p in photos],
             speeds=speeds_of(photos),
             linked=len({i for k in links for i in (k.a, k.b)}),
             adjust=adjust,
-            unfit=lambda t: unfit_cameras(
-                t.found, priors_by_camera(enlarged(t.begun), self.distortion)
-            ),
+            unfit=lambda t: unfit_cameras(t.found, priors_of(t)),
+            cut=lambda t: cut_cameras(t.found, priors_of(t)),
             guess=guess,
         )
         tried = begun_with(priors, survey, repair=self.repair)
@@ -186,7 +194,7 @@ class Bundle:
         sizes = [(p.width, p.height) for p in photos]
         large = len(start.placed) > self.many
         setup = set_up(photos, priors, start, distortion=self.distortion, repair=self.repair)
-        setup = loosened(setup, begun.loose)
+        setup = uncentred(loosened(setup, begun.loose), begun.cut)
         begin = each = self.per_photo
         least = 0
         if large:

@@ -24,7 +24,7 @@ from skyquilt.alignment.oblique_start import (
     turned_priors,
     untold,
 )
-from skyquilt.alignment.unfit_cameras import fits_as_well, unfit_notes
+from skyquilt.alignment.unfit_cameras import cut_notes, fits_as_well, fits_cut, unfit_notes
 from skyquilt.errors import AlignmentError
 from skyquilt.model.poses import Alignment, MapFrame, Prior
 
@@ -52,6 +52,8 @@ class Beginning:
     """Factors of photos that are enlarged against others of their camera."""
     loose: frozenset[str] = frozenset()
     """Cameras whose shutters and aspect ratios pictures alone tell."""
+    cut: frozenset[str] = frozenset()
+    """Cameras whose principal points pictures alone tell."""
     in_space: bool = False
     """Photos begin where they report to be, as those of an oblique survey do."""
     name: str = ""
@@ -89,6 +91,8 @@ class Survey:
     """Adjusts the survey."""
     unfit: Callable[[Tried], frozenset[str]]
     """Names of cameras that photos contradict (`unfit_cameras`)."""
+    cut: Callable[[Tried], frozenset[str]]
+    """Names of those whose photos may have been cut off (`cut_cameras`)."""
     guess: Callable[[Beginning], Sequence[Prior] | None]
     """Priors with directions with which matched rays meet clearly better; None without any."""
 
@@ -155,6 +159,17 @@ def _enlargements(last: Tried, survey: Survey) -> Tried:
     if best is last:
         return last
     return replace(best, notes=(*last.notes, enlarged_note(best.begun.enlarged, survey.cameras)))
+
+
+def _cut_pictures(last: Tried, survey: Survey) -> Tried:
+    """Principal points of photos that were cut off are told by these alone."""
+    cameras = survey.cut(last)
+    if not cameras:
+        return last
+    other = survey.tried(last.begun, cut=cameras, name="cut ")
+    if not fits_cut(other.found, last.found):
+        return last
+    return replace(other, notes=(*last.notes, *cut_notes(other.found, cameras)))
 
 
 def _late_positions(last: Tried, survey: Survey) -> Tried:
@@ -259,6 +274,7 @@ def priors_taken(
 REPAIRS: tuple[Callable[[Tried, Survey], Tried], ...] = (
     _as_reported,
     _enlargements,
+    _cut_pictures,
     _late_positions,
     _late_moments,
     _false_tilts,

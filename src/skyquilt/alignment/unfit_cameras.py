@@ -1,8 +1,9 @@
 """Cameras that are not what they are taken for: shutters that expose row by row without a word, and
-pictures that were resized along one side.
+pictures that were resized along one side or cut off at one.
 
-Such a camera is adjusted again with a readout time and an aspect ratio that pictures alone tell. A
-drone that turns with its lines hardly tells the two apart, so they are loosened together.
+Such a camera is adjusted again with a readout time and an aspect ratio, or with a principal point,
+that pictures alone tell. A drone that turns with its lines hardly tells the first two apart, so
+they are loosened together.
 """
 
 from collections.abc import Collection, Mapping
@@ -11,13 +12,17 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.enlarged import misfit_px
+from skyquilt.alignment.enlarged import BETTER, misfit_px
 from skyquilt.alignment.outcome import ASPECT, NO_FIT
 from skyquilt.alignment.problem import READOUT
 from skyquilt.alignment.setup import SIGMA_ASPECT, Setup
+from skyquilt.model.camera import PARAMETERS
 from skyquilt.model.poses import Alignment
 
 Floats = NDArray[np.float64]
+CameraPriors = Mapping[str, tuple[Floats, Floats, NDArray[np.bool_]]]
+"""Of each camera the values, their deviations, and which are estimated (`setup.priors_by_camera`).
+"""
 CONTRADICTED = 2.2
 """A readout time and an aspect ratio that together lie so many deviations off their priors
 contradict these.
@@ -28,14 +33,22 @@ LOOSE = {READOUT: 0.1, ASPECT: 0.1}
 """Deviations (s, ratio) of what pictures alone tell."""
 WORSE = 1.03
 """The larger freedom is taken where photos fit at most so many times as badly with it."""
+KEPT = 0.99
+"""Share of the observations that another principal point keeps at least."""
+CX, CY = (PARAMETERS.index(name) for name in ("cx", "cy"))
+OFF_MIDDLE = 3.0
+"""A principal point so many deviations off the middle of the picture contradicts that nothing was
+cut off.
+"""
+ASSUMED_MIDDLE, LOOSE_MIDDLE = 0.009, 0.15
+"""Deviations of the principal point as shares of the picture's longer side: one at least as wide is
+assumed, and that of what pictures alone tell.
+"""
 
 
-def unfit_cameras(
-    found: Alignment, priors: Mapping[str, tuple[Floats, Floats, NDArray[np.bool_]]]
-) -> frozenset[str]:
+def unfit_cameras(found: Alignment, priors: CameraPriors) -> frozenset[str]:
     """Names of cameras whose photos contradict the shutter or the shape of pixels that is assumed
-    of them, or fit no camera as it is assumed. `priors`: of each camera the values, their
-    deviations, and which are estimated (`setup.priors_by_camera`).
+    of them, or fit no camera as it is assumed.
     """
     unfit = set[str]()
     for key, (K0, sigma, free) in priors.items():
@@ -44,10 +57,49 @@ def unfit_cameras(
         apart = np.abs(np.r_[camera.vector, camera.readout_s] - K0) / sigma
         assumed = [c for c in ASSUMED if free[c] and sigma[c] >= ASSUMED[c]]
         other = float(np.linalg.norm(apart[assumed])) > CONTRADICTED
-        told = any(note.startswith(f"The photos of {key} {NO_FIT}") for note in found.notes)
-        if other or (told and assumed):
+        if other or (assumed and _fits_none(found, key)):
             unfit.add(key)
     return frozenset(unfit)
+
+
+def cut_cameras(found: Alignment, priors: CameraPriors) -> frozenset[str]:
+    """Names of cameras whose photos show the principal point beside the middle of the picture, or
+    fit no camera as it is assumed: other programs may have cut them off.
+    """
+    cut = set[str]()
+    for key, (K0, sigma, free) in priors.items():
+        if (camera := found.cameras.get(key)) is None:
+            continue
+        if not _middle_assumed(sigma, free, max(camera.width, camera.height)):
+            continue
+        apart = (camera.vector[[CX, CY]] - K0[[CX, CY]]) / sigma[[CX, CY]]
+        if float(np.linalg.norm(apart)) > OFF_MIDDLE or _fits_none(found, key):
+            cut.add(key)
+    return frozenset(cut)
+
+
+def _middle_assumed(sigma: Floats, free: NDArray[np.bool_], longer: float) -> bool:
+    """Whether the principal point is estimated, and known from no calibration; `longer`: side of
+    the picture in px.
+    """
+    return bool(free[[CX, CY]].all() and (sigma[[CX, CY]] >= ASSUMED_MIDDLE * longer).all())
+
+
+def _fits_none(found: Alignment, key: str) -> bool:
+    """Whether an alignment says that a camera's photos fit none as it is taken for."""
+    return any(note.startswith(f"The photos of {key} {NO_FIT}") for note in found.notes)
+
+
+def uncentred(setup: Setup, cameras: Collection[str]) -> Setup:
+    """The same for an adjustment in which pictures alone tell the principal points that are assumed
+    of some cameras.
+    """
+    sigma: Floats = setup.base.sigma_K.copy()
+    for row in (k for k, key in enumerate(setup.camera_keys) if key in cameras):
+        longer = float(setup.size[setup.members[setup.camera == row]].max())
+        if _middle_assumed(sigma[row], setup.base.free[row], longer):
+            sigma[row, [CX, CY]] = LOOSE_MIDDLE * longer
+    return replace(setup, base=replace(setup.base, sigma_K=sigma)) if cameras else setup
 
 
 def loosened(setup: Setup, cameras: Collection[str]) -> Setup:
@@ -84,5 +136,30 @@ def unfit_notes(found: Alignment, cameras: Collection[str]) -> tuple[str, ...]:
             f" its focal lengths along columns and rows have the ratio {ratio:.3f} (1: nobody"
             " resized the pictures along one side). State them by --shutter-readout and --cameras"
             " if you know better."
+        )
+    return tuple(notes)
+
+
+def fits_cut(other: Alignment, found: Alignment) -> bool:
+    """Whether an alignment with principal points that pictures tell is the better one: it holds as
+    many photos and nearly as many observations, and fits these clearly better.
+    """
+    as_many = len(other.held) >= len(found.held)
+    as_many &= len(other.ties.photo) >= KEPT * len(found.ties.photo)
+    return as_many and misfit_px(other) < BETTER * misfit_px(found)
+
+
+def cut_notes(found: Alignment, cameras: Collection[str]) -> tuple[str, ...]:
+    """What the user is told of each camera."""
+    notes = []
+    for key in sorted(cameras):
+        camera = found.cameras[key]
+        right, down = camera.cx - (camera.width - 1) / 2, camera.cy - (camera.height - 1) / 2
+        notes.append(
+            f"The optical axis of {key} meets its photos {abs(right):.0f} px"
+            f" {'right' if right > 0 else 'left'} of their middle and {abs(down):.0f} px"
+            f" {'below' if down > 0 else 'above'} it, as they show where they overlap: they were"
+            " probably cropped along one side. The map is made so; photos as the camera wrote them"
+            " are better."
         )
     return tuple(notes)
