@@ -100,6 +100,33 @@ def test_photos_that_only_hold_each_other_are_weak_together():
     assert sorted(found) == [first, first + 1, first + 2]
 
 
+@pytest.mark.parametrize(
+    ("displaced_m", "reporting", "kept"), [(0.0, 6, True), (4.0, 6, False), (0.0, 4, False)]
+)
+def test_a_line_beside_the_rest_is_held_by_its_own_positions(displaced_m, reporting, kept):
+    """Six photos that share a corner with the rest, as flight lines far apart do. Their positions
+    place them as they would a block that is linked with nothing, unless tie points moved them.
+    """
+    line = [pose(130, 20 * k - 50) for k in range(6)]
+    xyz = np.concatenate([hills(3000), hills(3000, 3, 70.0) + [150, 0, 0]])
+    first = len(LAWN)
+    own = {first + k: lambda px, xyz: xyz[:, 0] > 90 for k in range(1, 6)}
+    own[first] = lambda px, xyz: (xyz[:, 0] > 90) | (np.arange(len(xyz)) % 400 == 0)
+    found = block([*LAWN, *line], xyz, shows=own)
+    rng = np.random.default_rng(2)
+    told = [
+        replace(
+            prior(found.poses[k].map_C + [*rng.normal(0, 0.5, 2), 0], sigma=0.5), yaw_deg=np.nan
+        )
+        for k in range(first)
+    ]
+    for k in range(6):
+        at = found.poses[first + k].map_C + [*rng.normal(0, 0.5, 2), 0] + [displaced_m, 0, 0]
+        told.append(NOTHING if k >= reporting else replace(prior(at, sigma=0.5), yaw_deg=np.nan))
+    left_out = set(weak_photos(found, told))
+    assert left_out == (set() if kept else set(range(first, first + 6)))
+
+
 @pytest.mark.parametrize("wide", [1.0, 0.15])
 def test_the_deviation_is_the_scatter_of_resections(wide):
     where, xyz = pose(0, 0, pitch=12, roll=-5), hills(5000)

@@ -30,6 +30,11 @@ from two directions, and deviations say nothing of the other one.
 """
 STATED_DEG = 5.0
 """Tilts with a larger standard deviation than this are guesses, not reports."""
+FEWEST_PLACED, EXTENDED, AGREEING = 5, 6.0, 2.5
+"""Photos whose positions place a group that hangs on the rest by too little; how many of the
+positions' deviations they extend over at least; and by how many (median) they lie off at most,
+where the rest lies.
+"""
 AGAIN = 1.2
 """A photo is looked at again when it has this many times as many points as before."""
 GRID = np.stack(np.meshgrid(*2 * [np.linspace(0.02, 0.98, 5)]), -1).reshape(-1, 2)
@@ -64,9 +69,44 @@ def _left_out(
         rest -= groups[-1]
         if not rest and len(groups) == 1:
             return {}
-        if len(rest) <= max(map(len, groups)):
+        if len(rest) < FEWEST_PLACED and len(rest) <= max(map(len, groups)):
             break
-    return whole.grown(set(block), max(groups, key=len))
+    largest = max(groups, key=len)
+    reasons = whole.grown(set(block), largest)
+    held = set(block) - reasons.keys()
+    for group in groups:
+        if group is not largest and _placed(alignment, group & reasons.keys(), held, priors):
+            reasons = {i: why for i, why in reasons.items() if i not in group}
+    return reasons
+
+
+def _placed(alignment: Alignment, group: set[int], held: set[int], priors: Sequence[Prior]) -> bool:
+    """Whether the positions of a group's own photos place it, as they would a block that is linked
+    with nothing, and agree with where it lies beside those that are `held`: a flight line that
+    overlaps the next one by little. False where tie points moved it elsewhere.
+    """
+    own, others = _off_positions(alignment, group, priors), _off_positions(alignment, held, priors)
+    if len(own) < FEWEST_PLACED or len(others) < FEWEST_PLACED:
+        return False
+    told = np.array([priors[i].map_C[:2] for i in _located(group, priors)])
+    stated = float(np.median([priors[i].sigma_C[0] for i in _located(group | held, priors)]))
+    middle = np.median(others, axis=0)
+    usual = max(stated, float(np.median(np.linalg.norm(others - middle, axis=1))))
+    if float(np.ptp(told, axis=0).max()) < EXTENDED * usual:
+        return False
+    return float(np.median(np.linalg.norm(own - middle, axis=1))) < AGREEING * usual
+
+
+def _located(photos: set[int], priors: Sequence[Prior]) -> list[int]:
+    """Those of the photos that report a position, in order."""
+    return [i for i in sorted(photos) if np.isfinite(priors[i].map_C[:2]).all()]
+
+
+def _off_positions(alignment: Alignment, photos: set[int], priors: Sequence[Prior]) -> Array:
+    """(n, 2) how far photos that report a position lie from it in m."""
+    return np.array(
+        [alignment.poses[i].map_C[:2] - priors[i].map_C[:2] for i in _located(photos, priors)]
+    ).reshape(-1, 2)
 
 
 class _Growth:
