@@ -556,6 +556,22 @@ def test_stretched_pictures_are_named_where_nothing_is_to_be_repaired(aspect, by
         assert said == pytest.approx(aspect, abs=0.01)
 
 
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=SLOW) for k in (1, 2))])
+def test_photos_cropped_towards_a_corner_keep_their_lens(seed):
+    """The axis meets them 150 px right and 110 px below the middle; two lines that were flown in
+    opposite directions look like displaced positions then.
+    """
+    lens = np.r_[LENS[0], LENS[1] + 150, LENS[2] + 110, LENS[3:]]
+    flown = Flown(seed, lens=lens, lines=2)
+    found = flown.aligned()
+    camera = found.cameras["cam"]
+    assert (camera.cx, camera.cy) == pytest.approx(lens[1:3], abs=8)
+    assert relative_error(flown, found) < 0.35
+    (note,) = [n for n in found.notes if "optical axis of cam" in n]
+    assert " px right of their middle" in note and " px below it" in note
+    assert not any("displaced" in n for n in found.notes)
+
+
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_ordinary_pictures_are_not_called_stretched(seed):
     notes = " ".join(Flown(seed).aligned().notes)

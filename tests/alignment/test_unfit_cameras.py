@@ -1,4 +1,4 @@
-"""Cameras that contradict the shutter and the square pixels that are assumed of them.
+"""Cameras that contradict the shutter, the square pixels and the centre that are assumed of them.
 
 Whole maps with them: `tests/end_to_end/test_untold_shutter.py`; resized pictures: `test_bundle.py`.
 """
@@ -12,7 +12,16 @@ from skyquilt.alignment.outcome import ASPECT, NO_FIT
 from skyquilt.alignment.problem import READOUT
 from skyquilt.alignment.setup import priors_by_camera, set_up
 from skyquilt.alignment.start import find_start
-from skyquilt.alignment.unfit_cameras import loosened, unfit_cameras, unfit_notes
+from skyquilt.alignment.unfit_cameras import (
+    CX,
+    CY,
+    cut_cameras,
+    cut_notes,
+    loosened,
+    uncentred,
+    unfit_cameras,
+    unfit_notes,
+)
 from skyquilt.model.camera import Camera
 from skyquilt.model.photo import Shutter
 from tests.alignment.surveys import FOCAL, HEIGHT, WIDTH, alignment, photo
@@ -92,6 +101,52 @@ def test_only_what_is_assumed_of_these_cameras_is_loosened(setup_of):
     rest = [k for k in range(loose.shape[1]) if k not in (READOUT, ASPECT)]
     assert np.array_equal(loose[:, rest], setup.base.sigma_K[:, rest])
     assert loosened(setup, ()) is setup
+
+
+def found_at(cx, cy, *, notes=()):
+    camera = Camera(width=WIDTH, height=HEIGHT, focal=FOCAL, cx=cx, cy=cy)
+    return replace(alignment(), cameras={"cam": camera}, notes=notes)
+
+
+@pytest.mark.parametrize(
+    ("right", "down", "cut"),
+    [(0, 0, False), (16, 16, False), (25, 0, True), (-20, -18, True), (0, 110, True)],
+)
+def test_pictures_are_taken_for_cropped_beyond_three_deviations(right, down, cut):
+    """One deviation is a hundredth of the longer side: 8 px."""
+    found = found_at((WIDTH - 1) / 2 + right, (HEIGHT - 1) / 2 + down)
+    photos = [photo(f"{i}.jpg") for i in range(8)]
+    assert cut_cameras(found, priors_by_camera(photos, "full")) == ({"cam"} if cut else set())
+
+
+def test_a_calibrated_principal_point_is_not_questioned():
+    calibrated = Camera(width=WIDTH, height=HEIGHT, focal=FOCAL, cx=400.0, cy=300.0,
+                        sigmas=(1.0, 1.0, 1.0, *[1e-3] * 3, *[1e-4] * 2, 5e-4, 0.0))  # fmt: skip
+    photos = [photo(f"{i}.jpg", calibration=calibrated) for i in range(8)]
+    note = f"The photos of cam {NO_FIT}: and more."
+    priors = priors_by_camera(photos, "full")
+    assert cut_cameras(found_at(500.0, 300.0, notes=(note,)), priors) == set()
+    plain = priors_by_camera([photo(f"{i}.jpg") for i in range(8)], "full")
+    assert cut_cameras(found_at(400.0, 300.0, notes=(note,)), plain) == {"cam"}
+
+
+def test_only_principal_points_of_these_cameras_are_loosened(setup_of):
+    setup = setup_of({"a": UNKNOWN, "b": UNKNOWN, "c": TOLD})
+    loose = uncentred(setup, {"a"}).base.sigma_K
+    a = setup.camera_keys.index("a")
+    assert loose[a, [CX, CY]] == pytest.approx(0.15 * WIDTH)
+    loose[a, [CX, CY]] = setup.base.sigma_K[a, [CX, CY]]
+    assert np.array_equal(loose, setup.base.sigma_K)
+    assert uncentred(setup, ()) is setup
+
+
+@pytest.mark.parametrize(
+    ("cx", "cy", "said"),
+    [(499.5, 189.5, "100 px right of their middle and 110 px above it"),
+     (379.5, 309.5, "20 px left of their middle and 10 px below it")],
+)  # fmt: skip
+def test_where_the_axis_meets_is_told(cx, cy, said):
+    assert said in cut_notes(found_at(cx, cy), {"cam"})[0]
 
 
 @pytest.fixture

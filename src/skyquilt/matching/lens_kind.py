@@ -98,8 +98,8 @@ def may_be_fisheye(lens: Camera) -> bool:
 def fisheye_note(camera: str) -> str:
     """What a user should know of a camera that proved to have a fisheye."""
     return (
-        f"The lens of {camera} is a fisheye's, as its photos show where they overlap; it is"
-        " adjusted as one."
+        f"The lens of {camera} bends pictures as a fisheye's does, as they show where they"
+        " overlap; it is adjusted as one."
     )
 
 
