@@ -1,13 +1,17 @@
 """What settled photos teach about the metadata of those to come."""
 
+import json
 import re
 import shutil
 
+import piexif
 import pytest
 
 from skyquilt.geometry.frames import angle_difference_deg, angles_from_cam_R_map
 from skyquilt.live.live_map import LiveMap
 from skyquilt.live.settings import LiveSettings
+from skyquilt.photos.read import read_photo
+from skyquilt.photos.survey import placed_plausibly
 from tests.end_to_end.conftest import taken_apart
 from tests.photos.conftest import with_segment
 
@@ -84,4 +88,63 @@ def test_the_first_photo_is_placed_as_its_compass_says(flight, drone, tmp_path):
     live.add(flight.photos[0])
     path = sorted(drone.glob("*.jpg"))[1]
     assert heading_error_deg(live, flight, path) == pytest.approx(LIE_DEG, abs=15)
+    live.close()
+
+
+def stuck(flight, folder, repeated):
+    """The flight's photos, some with the position of the one before, as a stuck receiver's."""
+    folder.mkdir(parents=True)
+    place = None
+    for k, path in enumerate(flight.photos):
+        exif, _, picture = taken_apart(path.read_bytes())
+        told = piexif.load(exif)
+        if k in repeated:
+            told["GPS"] = place
+        place = told["GPS"]
+        (folder / path.name).write_bytes(with_segment(picture, 0xE1, piexif.dump(told)))
+    return sorted(folder.glob("*.jpg"))
+
+
+def notes_of(live):
+    rows = live.ledger.rows("select body from event where kind = 'note' order by seq")
+    return [text for (body,) in rows if "position" in (text := json.loads(body)["text"])]
+
+
+def sigmas(live):
+    return {m.photo.name: m.prior.sigma_C.tolist() for m in live.members.by_id.values()}
+
+
+def test_repeated_positions_are_doubted_as_in_a_whole_flight(flight, tmp_path):
+    """After every photo the deviations are those that the photos so far have as a survey; those of
+    the newest change as soon as the receiver goes on.
+    """
+    paths = stuck(flight, tmp_path / "drone", repeated={2, 3, 4})
+    live = LiveMap(tmp_path / "out", SETTINGS)
+    live.add(paths[0])
+    for count, path in enumerate(paths[1:], 2):
+        live.intake.take_file(path, "drone")
+        live.members.take_up()
+        photos, _ = placed_plausibly([read_photo(p) for p in paths[:count]])
+        for photo in photos:
+            assert sigmas(live)[photo.name][:2] == [photo.position.sigma_xy_m] * 2
+    widened = [name for name, sigma in sigmas(live).items() if sigma[0] > 5]
+    assert widened == [p.name for p in paths[2:5]]
+    first, second = notes_of(live)  # of one photo, and of two
+    assert first.startswith("So far: One photo (") and "repeats the position" in first
+    assert second.startswith("So far: 2 photos (") and "repeat the position" in second
+    before = sigmas(live)
+    live.close()
+    again = LiveMap(tmp_path / "out", SETTINGS)
+    assert sigmas(again) == before and notes_of(again) == [first, second]
+    again.close()
+
+
+def test_a_receiver_that_never_moved_tells_no_step(flight, tmp_path):
+    paths = stuck(flight, tmp_path / "drone", repeated=set(range(1, 6)))
+    live = LiveMap(tmp_path / "out", SETTINGS)
+    live.add(paths[0])
+    for path in paths[1:]:
+        live.intake.take_file(path, "drone")
+    live.members.take_up()
+    assert len(set(map(str, sigmas(live).values()))) == 1 and not notes_of(live)
     live.close()

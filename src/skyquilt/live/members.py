@@ -2,8 +2,9 @@
 
 import json
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,10 @@ from skyquilt.model.camera import ADJUSTABLE, PARAMETERS, Camera
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.poses import MapFrame, Motion, Pose, Prior
 from skyquilt.outside import real, whole
-from skyquilt.photos.implausible_positions import on_sphere, sphere
+from skyquilt.photos.implausible_positions import on_sphere, sphere, with_coarse_deviations
 from skyquilt.photos.read import read_photo
 from skyquilt.photos.shutter import stated_shutter
+from skyquilt.photos.survey import capture_order
 
 FISHEYES = "fisheyes"
 """Name in the ledger of the cameras that proved to have a fisheye."""
@@ -33,6 +35,10 @@ FAR_M = 100_000.0
 """A position farther than this from where the map began is not used: it is that of another flight,
 and the map's projection is bent there.
 """
+LOOKED_BACK = 300
+"""Photos of a camera by which it is told whether positions are rounded or repeat the one before."""
+COARSE = "coarse positions"
+"""Name in the ledger of the number of photos that a note named last for that."""
 ON_MAP = ("placed", "refined")
 """States of photos that are drawn."""
 
@@ -126,6 +132,34 @@ class Members:
         self._began, self.near = sphere(np.array([[latitude, longitude]]))[0], []
         for member in self.by_id.values():
             member.prior = self._prior(member)
+        self._doubt_positions(list(self.by_id.values()))
+
+    def _doubt_positions(self, new: Sequence[Member]) -> None:
+        """Gives positions that are rounded, or repeat the one before as those of a slow or stuck
+        receiver do, deviations as large as they are (`with_coarse_deviations`). Photos are noted
+        whenever there are twice as many of them.
+        """
+        noted, coarse, notes = int(self.ledger.meta(COARSE, 0)), 0, list[str]()
+        for key in dict.fromkeys(m.photo.camera_key for m in new):
+            alike = (m for m in reversed(self.by_id.values()) if m.photo.camera_key == key)
+            located = (m for m in alike if np.isfinite(m.prior.map_C[0]))
+            own = list(islice(located, LOOKED_BACK + len(new)))
+            own.sort(key=lambda m: capture_order(m.photo))
+            photos, said = with_coarse_deviations([m.photo for m in own])
+            if len({p.position for p in photos}) < 2:
+                continue  # there is no step to tell how far photos are apart
+            for member, photo in zip(own, photos, strict=True):
+                sigma = member.prior.sigma_C
+                if photo.position is not None and sigma[0] != photo.position.sigma_xy_m:
+                    sigma = np.array([*[photo.position.sigma_xy_m] * 2, sigma[2]])
+                    member.prior = replace(member.prior, sigma_C=sigma)
+            coarse += sum(a is not m.photo for a, m in zip(photos, own, strict=True))
+            notes += said
+        if coarse >= max(1, 2 * noted):
+            with self.ledger.change():
+                self.ledger.put_meta(COARSE, coarse)
+                for note in notes:
+                    self.ledger.tell("note", {"text": f"So far: {note}"})
 
     def _prior(self, member: Member) -> Prior:
         """The prior of a photo in the map's frame; a position far away is not used."""
@@ -197,6 +231,8 @@ class Members:
             self.block_of[member.id] = member.id
             self.blocks[member.id] = {member.id}
             new.append(member)
+        if self.frame is not None:
+            self._doubt_positions(new)
         return new
 
     def _seen(self, photo: Photo) -> Photo:

@@ -199,7 +199,8 @@ def with_coarse_deviations(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], 
                 kept[i] = photo
             changed = [new.name for old, new in zip(given, found, strict=True) if new is not old]
             if changed:
-                notes.append(f"{len(changed)} photos ({sentence_of(changed)}) {note}")
+                counted = "One photo" if len(changed) == 1 else f"{len(changed)} photos"
+                notes.append(f"{counted} ({sentence_of(changed)}) {note}")
     return tuple(kept), tuple(notes)
 
 
@@ -236,9 +237,12 @@ def _repeated(photos: Sequence[Photo]) -> tuple[list[Photo], str]:
     found = [
         p if first else _widened(p, float(m)) for p, first, m in zip(photos, new, away, strict=True)
     ]
+    repeat, they_were, counts = "repeats", "it was", "it counts"
+    if (~new).sum() > 1:
+        repeat, they_were, counts = "repeat", "they were", "they count"
     note = (
-        "repeat the position of the photo before: they were taken at the same place, or the"
-        " receiver was slow or stuck; they count as uncertain by up to"
+        f"{repeat} the position of the photo before: {they_were} taken at the same place, or the"
+        f" receiver was slow or stuck; {counts} as uncertain by up to"
         f" {away[~new].max():.0f} m."
     )
     return found, note
