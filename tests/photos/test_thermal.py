@@ -335,3 +335,53 @@ def test_a_broken_flir_block_is_no_temperature(tmp_path):
     (tmp_path / "a.jpg").write_bytes(bytes(data))
     photo = read_photo(tmp_path / "a.jpg")
     assert isinstance(photo, Photo) and photo.unit == "" and photo.dtype == "uint8"
+
+
+def void_tag(text):
+    return (42113, "s", 0, str(text), True)
+
+
+@pytest.mark.parametrize(
+    ("kind", "per", "zero", "fill", "told"),
+    [
+        (np.float32, 1, 0.0, -9999, False),
+        (np.float32, 1, 0.0, -9999, True),
+        (np.float32, 1, 0.0, 0, True),
+        (np.float32, 1, 0.0, -3.4028234663852886e38, True),
+        (np.float64, 1, 0.0, -1.7976931348623157e308, True),
+        (np.float32, 1, 0.0, 1e20, False),
+        (np.float32, 1, 0.0, np.inf, False),
+        (np.float32, 1, 0.0, -np.inf, False),
+        (np.float32, 1, 273.15, -9999, False),
+        (np.int16, 10, 0.0, -9999, False),
+        (np.int16, 10, 0.0, -32768, False),
+        (np.int16, 100, 0.0, -9999, False),
+        (np.int16, 100, 0.0, 32767, True),
+        (np.uint16, 100, 273.15, 65535, True),
+        (np.int32, 100, 273.15, -2147483648, False),
+    ],
+)
+def test_values_with_which_programs_fill_gaps_are_no_temperatures(
+    tmp_path, kind, per, zero, fill, told
+):
+    """They were mapped as temperatures, of -9999 degrees or infinite, without a word."""
+    degrees = np.random.default_rng(5).uniform(11, 21, (60, 80))
+    values = ((degrees + zero) * per).astype(kind)
+    values[:40] = fill  # most of the frame
+    tags = [void_tag(repr(fill))] if told else []
+    tifffile.imwrite(tmp_path / "t.tif", values, extratags=tags)
+    photo = read_photo(tmp_path / "t.tif", thermal_unit="auto")
+    assert photo.unit == "celsius"
+    found = read_color(photo)
+    assert np.isnan(found[:40]).all()
+    np.testing.assert_allclose(found[40:], degrees[40:], atol=0.11)
+
+
+def test_pictures_are_black_where_gdal_says_that_there_is_none(tmp_path):
+    values = np.random.default_rng(5).integers(10, 250, (60, 80, 3)).astype(np.uint8)
+    values[:20] = 255
+    values[30, 30] = 255, 10, 255  # pink, and no gap
+    tifffile.imwrite(tmp_path / "t.tif", values, photometric="rgb", extratags=[void_tag(255)])
+    found = read_color(read_photo(tmp_path / "t.tif"))
+    assert (found[:20] == 0).all()
+    assert np.array_equal(found[20:], values[20:])

@@ -26,6 +26,8 @@ from skyquilt.video.decoder import frame_of
 
 Pixels = NDArray[Any]
 Reduction = Literal[1, 2, 4, 8]
+_NODATA = 42113
+"""GDAL's tag of a TIFF: the value of pixels that have none, as text."""
 _HARMLESS = re.compile(
     r"\b\d{1,2} extraneous bytes before marker|JFIF|Inconsistent progression|Invalid SOS"
 )
@@ -213,8 +215,9 @@ def _emptied(pixels: Pixels, alpha: Pixels) -> Pixels:
 
 def read_tiff(file: BinaryIO, size: tuple[int, int]) -> Pixels:
     """The first page of a TIFF as (height, width, bands) without alpha, signed and wide types as
-    float32, black and white as 0 and 255, palettes and inks as RGB, see-through pixels as black or
-    NaN; `size`: the width and height that were checked.
+    float32, black and white as 0 and 255, palettes and inks as RGB, pixels that are see-through or
+    hold the value that stands for none as black or NaN; `size`: the width and height that were
+    checked.
     """
     import tifffile  # imported here because most photos are JPEGs
 
@@ -225,6 +228,7 @@ def read_tiff(file: BinaryIO, size: tuple[int, int]) -> Pixels:
         planar = page.planarconfig == 2 and pixels.ndim == 3
         kind, palette = int(page.photometric), page.colormap
         alpha = [int(e) in (1, 2) for e in page.extrasamples]
+        void = _void_value(page)
     if planar:
         pixels = np.moveaxis(pixels, 0, -1)
     if pixels.dtype == np.bool_:  # one bit for each pixel; `white` is the one that stands for it
@@ -232,8 +236,10 @@ def read_tiff(file: BinaryIO, size: tuple[int, int]) -> Pixels:
         pixels = np.where(pixels == white, 255, 0).astype(np.uint8)
     elif pixels.dtype == np.uint8 and kind == tifffile.PHOTOMETRIC.MINISWHITE:
         pixels = np.uint8(255) - pixels
+    empty = None if void is None else _equal(pixels, void)
     if pixels.dtype not in (np.uint8, np.uint16):
-        pixels = pixels.astype(np.float32)
+        with np.errstate(over="ignore"):  # what fills gaps may be larger
+            pixels = pixels.astype(np.float32)
     pixels = pixels if pixels.ndim == 3 else pixels[..., None]
     if kind == tifffile.PHOTOMETRIC.PALETTE and palette is not None:
         pixels = np.moveaxis(palette[:, pixels[..., 0]] // 257, 0, -1).astype(np.uint8)
@@ -243,4 +249,30 @@ def read_tiff(file: BinaryIO, size: tuple[int, int]) -> Pixels:
     elif True in alpha:
         kinds = [*[False] * (pixels.shape[2] - len(alpha)), *alpha]
         pixels = _emptied(pixels[..., np.invert(kinds)], pixels[..., kinds.index(True)])
+    if empty is not None and empty.any():
+        pixels[empty] = np.nan if pixels.dtype.kind == "f" else 0
     return np.ascontiguousarray(pixels)
+
+
+def _void_value(page: Any) -> float | None:
+    """The value that stands for none in a page of a TIFF, as GDAL states it; None where it states
+    none.
+    """
+    told = page.tags.get(_NODATA)
+    if told is None or not isinstance(told.value, str) or told.count > 64:
+        return None
+    try:
+        return float(told.value.strip("\0 "))
+    except ValueError:
+        return None
+
+
+def _equal(pixels: Pixels, void: float) -> NDArray[np.bool_]:
+    """(h, w) which pixels (h, w[, bands]) hold that value in all bands; programs write it with the
+    digits of a real number of 32 bits or of 64.
+    """
+    with np.errstate(over="ignore"):
+        same = (
+            pixels == void if pixels.dtype.kind in "iu" else pixels.astype("f4") == np.float32(void)
+        )
+    return np.asarray(same if same.ndim == 2 else same.all(axis=2))

@@ -18,6 +18,12 @@ _KELVIN = (220.0, 420.0)
 _CELSIUS = (-60.0, 160.0)
 _REFLECTANCE = (-0.1, 1.5)
 _DECICELSIUS, _CENTICELSIUS = 600.0, 6000.0
+_COLDEST, _HOTTEST = -273.15, 5000.0
+"""Degrees Celsius between which anything on the ground is; what a frame states beyond is none."""
+_FILLS = (-9999.0, -32768.0)
+"""Values with which programs fill pixels that have none."""
+_LARGEST = 1e9
+"""Values beyond this are fillings, too."""
 _KELVIN_PER = {"kelvin": 1.0, "decikelvin": 0.1, "centikelvin": 0.01}
 _CELSIUS_PER = {"celsius": 1.0, "decicelsius": 0.1, "centicelsius": 0.01}
 UNSTATED = "no unit is stated (set it with --thermal-unit)"
@@ -106,13 +112,15 @@ def thermal_frame_of_values(
     Where the meaning is not stated, it is derived from the median value. Integers: hundredths or
     tenths of a kelvin, and if they have a sign also of a degree Celsius; real numbers: kelvin or
     degrees Celsius; otherwise counts. `kind`: type of the values in the file (`int16`), where they
-    were converted.
+    were converted. Infinite values, those with which programs fill gaps, and temperatures that
+    there are not become NaN.
     """
     kind = kind or values.dtype.name
     whole = kind.startswith(("int", "uint"))
     real = values.astype(np.float32)
     if kind.startswith("uint"):
         real[values == 0] = np.nan
+    real[np.isin(real, _FILLS) | ~(np.abs(real) < _LARGEST)] = np.nan
     if stored:
         note = f"Its values are read as {stored}, as stated by the file or --thermal-unit."
         return _frame(real, stored, note)
@@ -162,5 +170,7 @@ def _frame(real: NDArray[np.float32], stored: Stored, note: str) -> ThermalFrame
         real = real * np.float32(_KELVIN_PER[stored]) - np.float32(273.15)
     elif stored in _CELSIUS_PER and stored != "celsius":
         real = real * np.float32(_CELSIUS_PER[stored])
+    if stored != "counts":
+        real[(real < _COLDEST) | (real > _HOTTEST)] = np.nan
     unit: Literal["celsius", "counts"] = "counts" if stored == "counts" else "celsius"
     return ThermalFrame(values=real, unit=unit, note=note, stored=stored)
