@@ -31,6 +31,7 @@ THERMAL_UNITS = (
     "centikelvin",
     "decicelsius",
     "centicelsius",
+    "fahrenheit",
     "counts",
 )
 VERTICAL_DATUMS = ("ellipsoid", "egm96", "takeoff")

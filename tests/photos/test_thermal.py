@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from skyquilt.model.photo import Photo
+from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.photos.flir import FlirCamera
 from skyquilt.photos.pixels import read_color, read_gray
 from skyquilt.photos.read import read_photo
@@ -385,3 +385,93 @@ def test_pictures_are_black_where_gdal_says_that_there_is_none(tmp_path):
     found = read_color(read_photo(tmp_path / "t.tif"))
     assert (found[:20] == 0).all()
     assert np.array_equal(found[20:], values[20:])
+
+
+def test_a_preview_before_the_measurements_is_not_taken_for_them(tmp_path):
+    """Programs write a picture in false colours first; it was mapped, without a word."""
+    degrees = np.random.default_rng(5).uniform(11, 21, (60, 80)).astype(np.float32)
+    preview = np.zeros((120, 160, 3), np.uint8)
+    with tifffile.TiffWriter(tmp_path / "t.tif") as out:
+        out.write(preview, photometric="rgb", extratags=[(272, "s", 0, "Camera", True)])
+        out.write(degrees)
+    with tifffile.TiffWriter(tmp_path / "u.tif") as out:
+        out.write(preview[::3, ::3], photometric="rgb", subfiletype=1, subifds=1)
+        out.write(degrees)
+    for name in "tu":
+        photo = read_photo(tmp_path / f"{name}.tif", thermal_unit="auto")
+        assert (photo.width, photo.height, photo.unit) == (80, 60, "celsius")
+        assert any("first page is a preview" in n for n in photo.notes)
+        np.testing.assert_array_equal(read_color(photo), degrees)
+    with tifffile.TiffWriter(tmp_path / "v.tif") as out:
+        out.write(degrees)
+        out.write(preview, photometric="rgb")
+    photo = read_photo(tmp_path / "v.tif")
+    assert any("It has 2 pages; the first (80x60 px" in n for n in photo.notes)
+    np.testing.assert_array_equal(read_color(photo), degrees)
+
+
+@pytest.mark.parametrize("planar", ["separate", "contig"])
+def test_a_second_band_of_unknown_meaning_is_left_out(tmp_path, planar):
+    """Such files ended the run with an error of OpenCV."""
+    degrees = np.random.default_rng(5).uniform(11, 21, (60, 80)).astype(np.float32)
+    both = np.stack([degrees, np.ones_like(degrees)], 0 if planar == "separate" else -1)
+    tifffile.imwrite(
+        tmp_path / "t.tif", both, planarconfig=planar, photometric="minisblack", metadata=None
+    )
+    photo = read_photo(tmp_path / "t.tif")
+    assert (photo.channels, photo.unit) == (1, "celsius")
+    assert any("second band" in n for n in photo.notes)
+    np.testing.assert_array_equal(read_color(photo), degrees)
+
+
+@pytest.mark.parametrize("unit", ["degC", ""])
+def test_gdal_scale_and_offset_make_degrees_of_integers(tmp_path, unit):
+    """They were taken for 20,000 degrees."""
+    degrees = np.random.default_rng(5).uniform(11, 21, (60, 80))
+    items = '<Item name="OFFSET" sample="0" role="offset">-40</Item>'
+    items += '<Item name="SCALE" sample="0" role="scale">0.0025</Item>'
+    items += f'<Item name="UNITTYPE" sample="0" role="unittype">{unit}</Item>' if unit else ""
+    values = np.round((degrees + 40) * 400).astype(np.uint16)
+    values[0] = 7
+    xml = f"<GDALMetadata>{items}</GDALMetadata>"
+    tifffile.imwrite(
+        tmp_path / "t.tif", values, extratags=[(42112, "s", 0, xml, True), void_tag(7)]
+    )
+    photo = read_photo(tmp_path / "t.tif", thermal_unit=None if unit else "auto")
+    assert (photo.unit, photo.stored) == ("celsius", "celsius")
+    found = read_color(photo)
+    assert np.isnan(found[0]).all()
+    np.testing.assert_allclose(found[1:], degrees[1:], atol=0.002)
+
+
+@pytest.mark.parametrize(
+    ("value", "kind", "said"),
+    [
+        (29515, np.uint16, "celsius"),
+        (29515, np.uint16, "decikelvin"),
+        (2951, np.uint16, "centikelvin"),
+        (22.5, np.float32, "kelvin"),
+    ],
+)
+def test_a_unit_in_which_all_are_impossible_is_refused(tmp_path, value, kind, said):
+    """A map of 29,515 degrees was made, without a word."""
+    tifffile.imwrite(tmp_path / "t.tif", np.full((60, 80), value, kind))
+    found = read_photo(tmp_path / "t.tif", thermal_unit=said)
+    assert isinstance(found, RejectedPhoto)
+    assert f"its values cannot be {said}" in found.reason and "--thermal-unit" in found.reason
+
+
+def test_fahrenheit(tmp_path):
+    degrees = np.random.default_rng(5).uniform(11, 21, (60, 80))
+    tifffile.imwrite(
+        tmp_path / "t.tif", (degrees * 9 / 5 + 32).astype(np.float32), description="unit: degF"
+    )
+    np.testing.assert_allclose(read_color(read_photo(tmp_path / "t.tif")), degrees, atol=1e-4)
+    said = read_photo(tmp_path / "t.tif", thermal_unit="fahrenheit")
+    np.testing.assert_allclose(read_color(said), degrees, atol=1e-4)
+
+
+def test_a_compression_that_is_not_read_is_named(tmp_path):
+    tifffile.imwrite(tmp_path / "t.tif", np.zeros((60, 80), np.float32), compression="lerc")
+    found = read_photo(tmp_path / "t.tif")
+    assert "34887 (LERC)" in found.reason and "save it uncompressed" in found.reason

@@ -56,7 +56,7 @@ MaxMemory = Annotated[
 THERMAL_UNITS = (
     "Unit of single-band TIFFs: auto (they are thermal; the unit is read from the file or derived"
     " from the values), celsius, kelvin, decikelvin, centikelvin,"
-    " decicelsius, centicelsius, counts."
+    " decicelsius, centicelsius, fahrenheit, counts."
 )
 UNIT_UNSAID = "auto for files of thermal cameras or with a stated unit"
 ThermalUnit = Annotated[str | None, typer.Option(help=THERMAL_UNITS, show_default=UNIT_UNSAID)]

@@ -21,7 +21,15 @@ Datum = Literal["takeoff", "sea_level", "egm96", "ellipsoid", "control", "unknow
 
 
 Stored = Literal[
-    "", "celsius", "kelvin", "decikelvin", "centikelvin", "decicelsius", "centicelsius", "counts"
+    "",
+    "celsius",
+    "kelvin",
+    "decikelvin",
+    "centikelvin",
+    "decicelsius",
+    "centicelsius",
+    "fahrenheit",
+    "counts",
 ]
 """What a value of a thermal TIFF may mean: degrees Celsius, (tenths, hundredths of a) kelvin, or
 sensor counts.

@@ -224,6 +224,8 @@ class Header:
     """Whether pixels may be see-through."""
     stored: str = ""
     """Type of the values in the file (`int16`), of a TIFF."""
+    notes: tuple[str, ...] = ()
+    """Sentences on what of the file is not read."""
 
 
 def read_header(path: Path, *, most_mp: float = MOST_MP) -> Header:

@@ -24,6 +24,12 @@ _STRANGE_COLOURS, _YCBCR, _JPEGS = frozenset({8, 9, 10, 32844, 32845}), 6, froze
 """CIELAB and its kin, logarithmic light; YCbCr, which is decoded as RGB within JPEG only."""
 MOST_STRIPS = 1_000_000
 """Largest number of strips or tiles of a TIFF."""
+_MOST_PAGES = 8
+"""Pages of a TIFF that are looked at."""
+_SAME_SHAPE = 0.03
+"""Relative difference of the ratios of their sides up to which two pages show the same."""
+_REDUCED, _MASK = 1, 4
+"""Bits of a page's subtype."""
 
 
 def check_tiff(file: BinaryIO, most_mp: float = MOST_MP) -> None:
@@ -50,11 +56,7 @@ def check_tiff(file: BinaryIO, most_mp: float = MOST_MP) -> None:
         file_bytes=file.seek(0, io.SEEK_END),
         most_mp=most_mp,
     )
-    if codec not in _CODECS:
-        raise UnreadablePhotoError(f"its TIFF compression {codec} is not one that is read")
-    pieces = max(directories.counts.get(_STRIPS, 0), directories.counts.get(_TILES, 0))
-    if pieces > MOST_STRIPS:
-        raise UnreadablePhotoError(f"its pixels are in more than {MOST_STRIPS} pieces")
+    _check_codec(codec, max(directories.counts.get(_STRIPS, 0), directories.counts.get(_TILES, 0)))
 
 
 def read_tiff(file: BinaryIO, most_mp: float) -> Header:
@@ -63,16 +65,17 @@ def read_tiff(file: BinaryIO, most_mp: float) -> Header:
     exif = read_tiff_tags(file)
     file.seek(0)
     with tifffile.TiffFile(file) as tiff:
-        page = tiff.pages[0]
-        if not isinstance(page, tifffile.TiffPage) or page.dtype is None:
+        first, (page, pages) = tiff.pages[0], measured_page(tiff)
+        if not isinstance(first, tifffile.TiffPage) or page.dtype is None:
             raise UnreadablePhotoError("its kind of TIFF cannot be decoded")
         _check_extent(page, file)
+        if page is not first:
+            _check_page(page, file.seek(0, io.SEEK_END), most_mp)
         packet = (
-            page.tags[_XMP_TAG].value
-            if _XMP_TAG in page.tags and page.tags[_XMP_TAG].count <= MOST_XMP
+            first.tags[_XMP_TAG].value
+            if _XMP_TAG in first.tags and first.tags[_XMP_TAG].count <= MOST_XMP
             else b""
         )
-        alpha = sum(int(e) in (1, 2) for e in page.extrasamples)
         kind = int(page.photometric)
         if kind in _STRANGE_COLOURS or (kind == _YCBCR and int(page.compression) not in _JPEGS):
             raise UnreadablePhotoError(
@@ -81,17 +84,95 @@ def read_tiff(file: BinaryIO, most_mp: float) -> Header:
             )
         inks = kind == tifffile.PHOTOMETRIC.SEPARATED and page.dtype == np.uint8
         coloured = inks or kind == tifffile.PHOTOMETRIC.PALETTE
+        alpha = [int(e) in (1, 2) for e in page.extrasamples]
+        beside = has_band_beside(page)
         return Header(
             kind="tiff",
             width=int(page.imagewidth),
             height=int(page.imagelength),
-            channels=3 if coloured else int(page.samplesperpixel) - alpha,
+            channels=3 if coloured else int(page.samplesperpixel) - sum(alpha) - beside,
             dtype="uint8" if coloured else _stored_as(page.dtype),
             exif=exif,
             xmp=parse_xmp((packet,) if isinstance(packet, bytes) and packet else ()),
-            alpha=alpha > 0,
+            alpha=any(alpha),
             stored=page.dtype.name,
+            notes=(*_page_notes(page, first, pages), *([_BESIDE] if beside else [])),
         )
+
+
+_BESIDE = "Its second band, of which the file does not say what it is, is left out."
+
+
+def has_band_beside(page: tifffile.TiffPage) -> bool:
+    """Whether a page has one band and a second one of unknown meaning (a mask, a confidence)."""
+    grey = page.photometric in (tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.MINISWHITE)
+    return (
+        grey and page.samplesperpixel == 2 and not any(int(e) in (1, 2) for e in page.extrasamples)
+    )
+
+
+def measured_page(tiff: tifffile.TiffFile) -> tuple[tifffile.TiffPage, int]:
+    """The page of a TIFF that is the photo, and the number of its full-size pages.
+
+    That is the first one, unless it is a preview: a page says that it is a reduced one and another
+    is not (the largest of those), or it has 8 bits and a later one, of the same shape, measurements
+    of 16 bits or more in one band.
+    """
+    first = tiff.pages.first
+    if len(tiff.pages) == 1 and first.subifds is None:
+        return first, 1
+    pages = _pages(tiff)
+    full = [p for p in pages if not int(p.subfiletype) & (_REDUCED | _MASK)]
+    if int(first.subfiletype) & _REDUCED and full:
+        first = max(full, key=lambda p: p.imagewidth * p.imagelength)
+    if first.dtype is not None and first.dtype.itemsize == 1:
+        shape = first.imagewidth / max(first.imagelength, 1)
+        for page in full:
+            deep = page.dtype is not None and page.dtype.itemsize > 1 and page.samplesperpixel == 1
+            alike = abs(page.imagewidth / max(page.imagelength, 1) / shape - 1) < _SAME_SHAPE
+            if deep and alike:
+                return page, len(full)
+    return first, len(full)
+
+
+def _pages(tiff: tifffile.TiffFile) -> list[tifffile.TiffPage]:
+    """The first pages of a TIFF, and those below its first one."""
+    found = [p for p in tiff.pages[:_MOST_PAGES] if isinstance(p, tifffile.TiffPage)]
+    below = tiff.pages.first.pages if tiff.pages.first.subifds else None
+    found += [p for p in (below or ())[:_MOST_PAGES] if isinstance(p, tifffile.TiffPage)]
+    return found
+
+
+def _page_notes(page: tifffile.TiffPage, first: tifffile.TiffPage, pages: int) -> tuple[str, ...]:
+    told = f"{page.imagewidth}x{page.imagelength} px, {page.samplesperpixel} x {page.dtype}"
+    if page is not first:
+        return (f"Its first page is a preview; the page of {told} is read.",)
+    return (f"It has {pages} pages; the first ({told}) is read.",) if pages > 1 else ()
+
+
+def _check_page(page: tifffile.TiffPage, size: int, most_mp: float) -> None:
+    """Refuses another page than the first by what it declares."""
+    check_picture(
+        page.imagewidth,
+        page.imagelength,
+        page.samplesperpixel * (page.dtype.itemsize + 4 if page.dtype is not None else 8),
+        file_bytes=size,
+        most_mp=most_mp,
+    )
+    _check_codec(int(page.compression), len(page.dataoffsets))
+
+
+def _check_codec(codec: int, pieces: int) -> None:
+    if codec not in _CODECS:
+        name = (
+            tifffile.COMPRESSION(codec).name if codec in list(tifffile.COMPRESSION) else "unknown"
+        )
+        raise UnreadablePhotoError(
+            f"its TIFF compression {codec} ({name}) is not one that is read; save it uncompressed,"
+            " or with LZW or Deflate"
+        )
+    if pieces > MOST_STRIPS:
+        raise UnreadablePhotoError(f"its pixels are in more than {MOST_STRIPS} pieces")
 
 
 def _check_extent(page: tifffile.TiffPage, file: BinaryIO) -> None:

@@ -20,8 +20,8 @@ from skyquilt.model.photo import Photo
 from skyquilt.outside import open_regular
 from skyquilt.photos.detector_faults import repaired
 from skyquilt.photos.headers import content_digest, read_header
-from skyquilt.photos.tags import MAKE
-from skyquilt.photos.thermal import thermal_frame_of_jpeg, thermal_frame_of_values
+from skyquilt.photos.tags import GDAL_METADATA, MAKE
+from skyquilt.photos.thermal import stated_scale, thermal_frame_of_jpeg, thermal_frame_of_values
 from skyquilt.video.decoder import frame_of
 
 Pixels = NDArray[Any]
@@ -132,7 +132,7 @@ def _decode(photo: Photo, reduction: Reduction, *, gray: bool) -> Pixels:
             return decode_jpeg(data, gray=gray or photo.channels == 1, reduction=reduction)
         if head == b"\x89PNG":
             return reduce_pixels(_png(file, photo), reduction)
-        pixels = read_tiff(file, size)
+        pixels = read_tiff(file, size, scaled=bool(photo.unit))
     if photo.channels == 1:
         pixels = pixels[..., 0]
     elif photo.channels == 3 and pixels.shape[2] == 1:  # grey among photos in colour
@@ -213,22 +213,25 @@ def _emptied(pixels: Pixels, alpha: Pixels) -> Pixels:
     return np.where(shown, pixels, np.asarray(empty, pixels.dtype))
 
 
-def read_tiff(file: BinaryIO, size: tuple[int, int]) -> Pixels:
-    """The first page of a TIFF as (height, width, bands) without alpha, signed and wide types as
-    float32, black and white as 0 and 255, palettes and inks as RGB, pixels that are see-through or
-    hold the value that stands for none as black or NaN; `size`: the width and height that were
-    checked.
+def read_tiff(file: BinaryIO, size: tuple[int, int], *, scaled: bool = False) -> Pixels:
+    """The page of a TIFF that is the photo as (height, width, bands) without alpha, signed and
+    wide types as float32, black and white as 0 and 255, palettes and inks as RGB, pixels that are
+    see-through or hold the value that stands for none as black or NaN; `size`: the width and height
+    that were checked; `scaled`: by the scale and offset that GDAL's tags state.
     """
     import tifffile  # imported here because most photos are JPEGs
 
+    from skyquilt.photos.lossless_headers import has_band_beside, measured_page
+
     with tifffile.TiffFile(file) as tiff:
-        page = tiff.pages.first
+        page, _ = measured_page(tiff)
         _same_size((int(page.imagewidth), int(page.imagelength)), size)
         pixels = np.asarray(page.asarray(maxworkers=1))
         planar = page.planarconfig == 2 and pixels.ndim == 3
         kind, palette = int(page.photometric), page.colormap
         alpha = [int(e) in (1, 2) for e in page.extrasamples]
-        void = _void_value(page)
+        void, beside = _void_value(page), has_band_beside(page)
+        scale = stated_scale(_text(page, GDAL_METADATA)) if scaled else None
     if planar:
         pixels = np.moveaxis(pixels, 0, -1)
     if pixels.dtype == np.bool_:  # one bit for each pixel; `white` is the one that stands for it
@@ -236,6 +239,8 @@ def read_tiff(file: BinaryIO, size: tuple[int, int]) -> Pixels:
         pixels = np.where(pixels == white, 255, 0).astype(np.uint8)
     elif pixels.dtype == np.uint8 and kind == tifffile.PHOTOMETRIC.MINISWHITE:
         pixels = np.uint8(255) - pixels
+    if beside and pixels.ndim == 3:
+        pixels = pixels[..., :1]
     empty = None if void is None else _equal(pixels, void)
     if pixels.dtype not in (np.uint8, np.uint16):
         with np.errstate(over="ignore"):  # what fills gaps may be larger
@@ -251,6 +256,10 @@ def read_tiff(file: BinaryIO, size: tuple[int, int]) -> Pixels:
         pixels = _emptied(pixels[..., np.invert(kinds)], pixels[..., kinds.index(True)])
     if empty is not None and empty.any():
         pixels[empty] = np.nan if pixels.dtype.kind == "f" else 0
+    if scale is not None:
+        pixels = pixels.astype(np.float32) * np.float32(scale[0]) + np.float32(scale[1])
+        if empty is not None:
+            pixels[empty] = np.nan
     return np.ascontiguousarray(pixels)
 
 
@@ -258,13 +267,16 @@ def _void_value(page: Any) -> float | None:
     """The value that stands for none in a page of a TIFF, as GDAL states it; None where it states
     none.
     """
-    told = page.tags.get(_NODATA)
-    if told is None or not isinstance(told.value, str) or told.count > 64:
-        return None
     try:
-        return float(told.value.strip("\0 "))
+        return float(_text(page, _NODATA))
     except ValueError:
         return None
+
+
+def _text(page: Any, tag: int) -> str:
+    """The text of a tag of a page; empty where there is none."""
+    told = page.tags.get(tag)
+    return told.value.strip("\0 ") if told is not None and isinstance(told.value, str) else ""
 
 
 def _equal(pixels: Pixels, void: float) -> NDArray[np.bool_]:

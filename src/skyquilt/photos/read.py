@@ -42,6 +42,7 @@ from skyquilt.photos.shutter import find_shutter
 from skyquilt.photos.thermal import (
     ThermalFrame,
     like_reflectance,
+    stated_scale,
     stated_unit,
     thermal_frame_of_jpeg,
     thermal_frame_of_values,
@@ -297,10 +298,14 @@ def _thermal_frame(path: Path, header: Header, said: str | None) -> ThermalFrame
     check_picture(header.width, header.height, 4, most_mp=MOST_THERMAL_MP, option="")
     try:
         with open_regular(path) as file:
-            values = read_tiff(file, (header.width, header.height))[..., 0]
+            values = read_tiff(file, (header.width, header.height), scaled=True)[..., 0]
         if not known and like_reflectance(values):
             return None
-        frame = thermal_frame_of_values(np.asarray(values), stored, header.stored)
+        scaled = stated_scale(header.exif.text(tag.GDAL_METADATA)) is not None
+        kind = values.dtype.name if scaled else header.stored
+        frame = thermal_frame_of_values(np.asarray(values), stored, kind)
+    except UnreadablePhotoError:
+        raise
     except Exception as error:  # tifffile raises many exceptions; all mean: no pixels
         raise UnreadablePhotoError(f"its pixels cannot be decoded ({error})") from error
     return frame if known or frame.unit == "celsius" else None
@@ -355,7 +360,8 @@ def _broken_notes(header: Header) -> tuple[str, ...]:
 def _other_notes(header: Header, lens: _Lens) -> tuple[str, ...]:
     time = read_time(header.exif, header.xmp)
     guess = _focal_note(lens.focal.source, header.exif.text(tag.MODEL))
-    return "" if time else "It has no capture time.", guess, _edit_note(header)
+    untimed = "" if time else "It has no capture time."
+    return *header.notes, untimed, guess, _edit_note(header)
 
 
 def _focal_note(source: str, model: str) -> str:

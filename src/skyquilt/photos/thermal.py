@@ -7,7 +7,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.errors import UnreadablePhotoError
 from skyquilt.model.photo import Stored
+from skyquilt.outside import real
 from skyquilt.photos.flir import read_flir
 from skyquilt.photos.headers import APP3, JpegHeader
 
@@ -20,16 +22,22 @@ _REFLECTANCE = (-0.1, 1.5)
 _DECICELSIUS, _CENTICELSIUS = 600.0, 6000.0
 _COLDEST, _HOTTEST = -273.15, 5000.0
 """Degrees Celsius between which anything on the ground is; what a frame states beyond is none."""
+_COLD, _HOT = -150.0, 1500.0
+"""Degrees Celsius between which the median of a frame is; beyond them its unit is another one."""
 _FILLS = (-9999.0, -32768.0)
 """Values with which programs fill pixels that have none."""
 _LARGEST = 1e9
 """Values beyond this are fillings, too."""
 _KELVIN_PER = {"kelvin": 1.0, "decikelvin": 0.1, "centikelvin": 0.01}
-_CELSIUS_PER = {"celsius": 1.0, "decicelsius": 0.1, "centicelsius": 0.01}
+_CELSIUS_PER = {"celsius": 1.0, "decicelsius": 0.1, "centicelsius": 0.01, "fahrenheit": 5 / 9}
 UNSTATED = "no unit is stated (set it with --thermal-unit)"
 """Part of the note on a frame whose unit follows from its values."""
 _STATED = re.compile(
     r"""\bunit\s*[:=]\s*["']?([a-z]+)|role=["']unittype["'][^>]*>\s*([^<]+?)\s*<""", re.IGNORECASE
+)
+_SCALED = re.compile(
+    r"""<Item(?=[^>]*\srole=["'](scale|offset)["'])(?=[^>]*\ssample=["']0["'])[^>]*>\s*([^<\s]+)""",
+    re.IGNORECASE,
 )
 _WORDS: dict[str, Stored] = {
     "celsius": "celsius",
@@ -44,6 +52,11 @@ _WORDS: dict[str, Stored] = {
     "ck": "centikelvin",
     "decicelsius": "decicelsius",
     "centicelsius": "centicelsius",
+    "fahrenheit": "fahrenheit",
+    "degf": "fahrenheit",
+    "f": "fahrenheit",
+    "\u00b0f": "fahrenheit",
+    "degreesfahrenheit": "fahrenheit",
     "counts": "counts",
     "dn": "counts",
 }
@@ -104,6 +117,17 @@ def stated_unit(text: str) -> Stored:
     return _WORDS.get(word, "")
 
 
+def stated_scale(text: str) -> tuple[float, float] | None:
+    """Scale and offset of the first band in GDAL's metadata: values in their unit are those stored
+    times the scale plus the offset. None where neither is stated.
+    """
+    told = {m[1].lower(): real(m[2]) for m in _SCALED.finditer(text)}
+    scale, offset = told.get("scale", 1.0), told.get("offset", 0.0)
+    if scale is None or offset is None or not scale or (scale, offset) == (1.0, 0.0):
+        return None
+    return scale, offset
+
+
 def thermal_frame_of_values(
     values: NDArray[np.generic], stored: Stored = "", kind: str = ""
 ) -> ThermalFrame:
@@ -114,17 +138,20 @@ def thermal_frame_of_values(
     degrees Celsius; otherwise counts. `kind`: type of the values in the file (`int16`), where they
     were converted. Infinite values, those with which programs fill gaps, and temperatures that
     there are not become NaN.
+
+    Raises:
+        UnreadablePhotoError: in the stated unit, most values are no temperatures.
     """
     kind = kind or values.dtype.name
     whole = kind.startswith(("int", "uint"))
-    real = values.astype(np.float32)
+    numbers = values.astype(np.float32)
     if kind.startswith("uint"):
-        real[values == 0] = np.nan
-    real[np.isin(real, _FILLS) | ~(np.abs(real) < _LARGEST)] = np.nan
+        numbers[values == 0] = np.nan
+    numbers[np.isin(numbers, _FILLS) | ~(np.abs(numbers) < _LARGEST)] = np.nan
     if stored:
         note = f"Its values are read as {stored}, as stated by the file or --thermal-unit."
-        return _frame(real, stored, note)
-    finite = real[np.isfinite(real) & ((real != 0) | (not whole))]
+        return _frame(numbers, stored, note)
+    finite = numbers[np.isfinite(numbers) & ((numbers != 0) | (not whole))]
     middle = float(np.median(finite)) if finite.size else float("nan")
     found = _likely(middle, whole=whole, signed=kind.startswith("int"))
     if found == "counts":
@@ -132,8 +159,8 @@ def thermal_frame_of_values(
             "fits no unit of temperature: values are counts, unless --thermal-unit states their"
             " unit."
         )
-        return _frame(real, found, f"Its median value {middle:g} {words}")
-    frame = _frame(real, found, "")
+        return _frame(numbers, found, f"Its median value {middle:g} {words}")
+    frame = _frame(numbers, found, "")
     degrees = float(np.nanmedian(frame.values))
     words = f"fits {found}, {degrees:.1f} degrees Celsius; {UNSTATED}."
     return replace(frame, note=f"Its median value {middle:g} {words}")
@@ -164,13 +191,21 @@ def _likely(middle: float, *, whole: bool, signed: bool) -> Stored:
     return next((unit for (low, high), unit in ranges if low <= middle <= high), "counts")
 
 
-def _frame(real: NDArray[np.float32], stored: Stored, note: str) -> ThermalFrame:
+def _frame(numbers: NDArray[np.float32], stored: Stored, note: str) -> ThermalFrame:
+    if stored == "counts":
+        return ThermalFrame(values=numbers, unit="counts", note=note, stored=stored)
     if stored in _KELVIN_PER:
-        real[real <= 0] = np.nan
-        real = real * np.float32(_KELVIN_PER[stored]) - np.float32(273.15)
-    elif stored in _CELSIUS_PER and stored != "celsius":
-        real = real * np.float32(_CELSIUS_PER[stored])
-    if stored != "counts":
-        real[(real < _COLDEST) | (real > _HOTTEST)] = np.nan
-    unit: Literal["celsius", "counts"] = "counts" if stored == "counts" else "celsius"
-    return ThermalFrame(values=real, unit=unit, note=note, stored=stored)
+        numbers[numbers <= 0] = np.nan
+        degrees = numbers * np.float32(_KELVIN_PER[stored]) - np.float32(273.15)
+    else:
+        zero = 32.0 if stored == "fahrenheit" else 0.0
+        degrees = (numbers - np.float32(zero)) * np.float32(_CELSIUS_PER[stored])
+    finite = degrees[np.isfinite(degrees)]
+    middle = float(np.median(finite)) if finite.size else 0.0
+    if not _COLD < middle < _HOT:
+        raise UnreadablePhotoError(
+            f"its values cannot be {stored}, as stated by the file or --thermal-unit: most would be"
+            f" temperatures of {middle:.0f} degrees Celsius"
+        )
+    degrees[(degrees < _COLDEST) | (degrees > _HOTTEST)] = np.nan
+    return ThermalFrame(values=degrees, unit="celsius", note=note, stored=stored)
