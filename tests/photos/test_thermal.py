@@ -1,5 +1,7 @@
 import math
 import struct
+import subprocess
+import sys
 
 import cv2
 import numpy as np
@@ -475,3 +477,16 @@ def test_a_compression_that_is_not_read_is_named(tmp_path):
     tifffile.imwrite(tmp_path / "t.tif", np.zeros((60, 80), np.float32), compression="lerc")
     found = read_photo(tmp_path / "t.tif")
     assert "34887 (LERC)" in found.reason and "save it uncompressed" in found.reason
+
+
+def test_other_programs_complaints_stay_off_the_terminal(tmp_path):
+    tags = [void_tag("-3.4028234663852886e+38")]
+    tifffile.imwrite(tmp_path / "t.tif", np.full((60, 80), 20, np.float32), extratags=tags)
+    code = "import sys; from pathlib import Path; from skyquilt.photos.read import read_photo;"
+    code += (
+        "from skyquilt.photos.pixels import read_color; read_color(read_photo(Path(sys.argv[1])))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "t.tif")], capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (0, "")

@@ -1,6 +1,7 @@
 """Headers of TIFF and PNG files: size, type, EXIF, XMP. Loaded only for these."""
 
 import io
+import logging
 from typing import BinaryIO
 
 import numpy as np
@@ -11,6 +12,9 @@ from skyquilt.errors import UnreadablePhotoError
 from skyquilt.outside import MOST_MP, check_picture
 from skyquilt.photos.headers import Dtype, Header
 from skyquilt.photos.tags import MOST_XMP, Directories, parse_exif, parse_xmp, read_tiff_tags
+
+# what it complains of is told by this program's own sentences, not on the terminal
+logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
 _PNG_BITS = 24
 """Byte of a PNG that says how many bits a value has."""
