@@ -490,3 +490,38 @@ def test_other_programs_complaints_stay_off_the_terminal(tmp_path):
         [sys.executable, "-c", code, str(tmp_path / "t.tif")], capture_output=True, text=True
     )
     assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("levels", "kind", "unit"),
+    [
+        ([4150, 4260, 4170, 4290, 4310, 4180], np.uint16, "counts"),  # some would be 141 degrees
+        ([21500, 21800, 22100, 22300, 21700, 22200], np.uint16, "counts"),  # or -52
+        ([29500, 29600, 29400, 29700, 29500, 43000], np.uint16, "centikelvin"),  # a fire
+        ([590, 560, 640, 700, 650, 580], np.int16, "centicelsius"),  # 59 degrees, or 6.5
+        ([1900, 2100, 2300, 2400, 2200, 2500], np.int16, "centicelsius"),  # 21, or -43
+        ([150.0, 140.0, 120.0, 100.0, 230.0, 110.0], np.float32, "celsius"),
+    ],
+)
+def test_frames_of_one_camera_have_one_unit(tmp_path, levels, kind, unit):
+    """Each frame had a unit of its own, and a map of degrees was made of both."""
+    noise = np.random.default_rng(5).normal(0, 3, (6, 60, 80))
+    for k, level in enumerate(levels):
+        tifffile.imwrite(tmp_path / f"t{k}.tif", (level + noise[k]).astype(kind))
+    survey = read_survey(tmp_path, thermal_unit="auto")
+    assert [p.stored for p in survey.photos] == [unit] * 6
+    assert any(f"are read as {unit} (6)" in n for n in survey.notes)
+    for k, p in enumerate(survey.photos):
+        alone = thermal_frame_of_values((levels[k] + noise[k]).astype(kind), unit)
+        np.testing.assert_array_equal(read_color(p), alone.values)
+
+
+def test_files_of_real_numbers_and_of_integers_keep_their_units(tmp_path):
+    degrees = np.random.default_rng(5).uniform(11, 21, (60, 80))
+    for k in range(3):
+        tifffile.imwrite(tmp_path / f"a{k}.tif", (degrees + k).astype(np.float32))
+        tifffile.imwrite(tmp_path / f"b{k}.tif", ((degrees + k + 273.15) * 100).astype(np.uint16))
+    survey = read_survey(tmp_path, thermal_unit="auto")
+    assert sorted(p.stored for p in survey.photos) == ["celsius"] * 3 + ["centikelvin"] * 3
+    for p in survey.photos:
+        np.testing.assert_allclose(read_color(p), degrees + int(p.name[1]), atol=0.02)

@@ -31,7 +31,7 @@ from skyquilt.photos.read import ReadPhoto, read_photo
 from skyquilt.photos.recoded import UNNAMED, recoded
 from skyquilt.photos.side_files import apply_positions
 from skyquilt.photos.side_rows import sentence_of
-from skyquilt.photos.thermal import UNSTATED
+from skyquilt.photos.thermal_units import in_one_unit, unit_notes
 from skyquilt.settings import InputSettings
 from skyquilt.video.read import CLIP_ENDINGS, side_files
 
@@ -176,6 +176,9 @@ def read_survey(
         read(path, name=name, thermal_unit=thermal_unit, most_mp=max_mp)
         for name, path in found.photos
     ]
+    files = in_one_unit(
+        files, lambda p, unit: read(p.path, name=p.name, thermal_unit=unit, most_mp=max_mp)
+    )
     rejected = [p for p in files if isinstance(p, RejectedPhoto)]
     films, more_rejected = read_clips(found.clips, geo) if clips else ((), ())
     rejected += more_rejected
@@ -324,7 +327,7 @@ def survey_notes(photos: Sequence[Photo], copies: int = 0) -> tuple[str, ...]:
     return (
         *_cameras(photos),
         *band_note(photos),
-        *_thermal_units(photos),
+        *unit_notes(photos),
         *_gaps(photos),
         *_clocks(photos),
         *_copies(copies),
@@ -348,28 +351,6 @@ def _cameras(photos: Sequence[Photo]) -> Iterator[str]:
         yield (
             f"{deep} photos in colour have floating-point values: these are mapped as recorded,"
             " without a balance of brightness; for one, save them with 8 or 16 bits."
-        )
-
-
-def _thermal_units(photos: Sequence[Photo]) -> Iterator[str]:
-    units = Counter(p.stored for p in photos if p.stored)
-    listed = " and ".join(f"{n} as {unit}" for unit, n in units.most_common())
-    if len(units) > 1:
-        yield (
-            f"Thermal TIFFs are read in different units, {listed}; set one for all with"
-            " --thermal-unit."
-        )
-    elif units:
-        guessed = next((f" {n}" for p in photos for n in p.notes if UNSTATED in n), "")
-        unit = listed.split(" as ")[1]
-        yield f"Thermal TIFFs are read as {unit} ({sum(units.values())}).{guessed}"
-    untold = [
-        p for p in photos if p.dtype != "uint8" and p.channels == 1 and not (p.unit or p.band_name)
-    ]
-    if untold:
-        yield (
-            f"{len(untold)} photos have one band of 16 bits or more and state no unit: they are"
-            " mapped as brightness; if they are temperatures, give --thermal-unit."
         )
 
 

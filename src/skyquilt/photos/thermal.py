@@ -32,6 +32,10 @@ _KELVIN_PER = {"kelvin": 1.0, "decikelvin": 0.1, "centikelvin": 0.01}
 _CELSIUS_PER = {"celsius": 1.0, "decicelsius": 0.1, "centicelsius": 0.01, "fahrenheit": 5 / 9}
 UNSTATED = "no unit is stated (set it with --thermal-unit)"
 """Part of the note on a frame whose unit follows from its values."""
+UNFIT = "fits no unit of temperature"
+"""The same where none does."""
+STATED = "as stated by the file or --thermal-unit."
+"""The end of the note on a frame whose unit is stated."""
 _STATED = re.compile(
     r"""\bunit\s*[:=]\s*["']?([a-z]+)|role=["']unittype["'][^>]*>\s*([^<]+?)\s*<""", re.IGNORECASE
 )
@@ -149,16 +153,12 @@ def thermal_frame_of_values(
         numbers[values == 0] = np.nan
     numbers[np.isin(numbers, _FILLS) | ~(np.abs(numbers) < _LARGEST)] = np.nan
     if stored:
-        note = f"Its values are read as {stored}, as stated by the file or --thermal-unit."
-        return _frame(numbers, stored, note)
+        return _frame(numbers, stored, f"Its values are read as {stored}, {STATED}")
     finite = numbers[np.isfinite(numbers) & ((numbers != 0) | (not whole))]
     middle = float(np.median(finite)) if finite.size else float("nan")
     found = _likely(middle, whole=whole, signed=kind.startswith("int"))
     if found == "counts":
-        words = (
-            "fits no unit of temperature: values are counts, unless --thermal-unit states their"
-            " unit."
-        )
+        words = f"{UNFIT}: values are counts, unless --thermal-unit states their unit."
         return _frame(numbers, found, f"Its median value {middle:g} {words}")
     frame = _frame(numbers, found, "")
     degrees = float(np.nanmedian(frame.values))

@@ -89,14 +89,15 @@ def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistrati
             reason="the visual photos have no adjusted poses; use --method bundle"
         )
     first = thermal[pairs[0][1]]
-    kinds = {(thermal[j].camera_key, thermal[j].channels, thermal[j].dtype) for _, j in pairs}
+    frames = [thermal[j] for _, j in pairs]
+    kinds = {(p.camera_key, p.channels, p.dtype, p.unit) for p in frames}
     if len(kinds) > 1:
         return RefusedRegistration(
             reason=f"the thermal photos are from {len(kinds)} cameras or formats"
         )
     asked = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, MOST_PAIRS).astype(int))]
-    told = [p for i, j in asked if (p := _registered(scene, i, thermal[j])) is not None]
-    rig = FindRig(free=_freedom(first))(told, first.lens)
+    seen = [p for i, j in asked if (p := _registered(scene, i, thermal[j])) is not None]
+    rig = FindRig(free=_freedom(first))(seen, first.lens)
     if isinstance(rig, RefusedRegistration):
         return rig
     poses = {k: _turned(placed.poses[i], rig) for k, (i, _) in enumerate(pairs)}

@@ -346,11 +346,17 @@ def find_features(
     )
 
 
+def _kind(kind: tuple[int, str, str, str]) -> str:
+    """In words: bands, type, spectrum and unit of pixels."""
+    channels, dtype, band, unit = kind
+    return f"{channels} x {dtype}, {band}" + (f" in {unit}" if unit else "")
+
+
 def of_one_kind(found: FeaturedPhotos) -> FeaturedPhotos:
     """The photos with the most frequent kind of pixels, since all photos of a map must have the
     same kind.
     """
-    kinds = [(p.channels, p.dtype, p.band) for p in found.photos]
+    kinds = [(p.channels, p.dtype, p.band, p.unit) for p in found.photos]
     common = max(set(kinds), key=lambda k: (kinds.count(k), k))
     keep = [i for i, k in enumerate(kinds) if k == common]
     odd = tuple(
@@ -359,8 +365,8 @@ def of_one_kind(found: FeaturedPhotos) -> FeaturedPhotos:
             reason=f"it is a {p.band} photo, and the map shows the {common[2]} ones; give thermal"
             " photos in a folder of their own, with --thermal"
             if p.band != common[2]
-            else f"its pixels ({p.channels} x {p.dtype}, {p.band}) differ from the survey's"
-            f" ({common[0]} x {common[1]}, {common[2]}); save all as one kind, or map it by itself",
+            else f"its pixels ({_kind(k)}) differ from the survey's ({_kind(common)}); save all"
+            " as one kind, or map it by itself",
         )
         for p, k in zip(found.photos, kinds, strict=True)
         if k != common
