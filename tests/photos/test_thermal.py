@@ -525,3 +525,15 @@ def test_files_of_real_numbers_and_of_integers_keep_their_units(tmp_path):
     assert sorted(p.stored for p in survey.photos) == ["celsius"] * 3 + ["centikelvin"] * 3
     for p in survey.photos:
         np.testing.assert_allclose(read_color(p), degrees + int(p.name[1]), atol=0.02)
+
+
+def test_colours_without_temperatures_are_told(tmp_path):
+    """A map of colours, and one beside raw data that are not read, were made without a word."""
+    counts = np.zeros((512, 640), np.uint16)
+    dji_jpeg(tmp_path, counts, short=2)  # as of a model whose frames have another form
+    told = " ".join(read_survey(tmp_path).notes)
+    assert "1 thermal photos hold a palette's colours or greys, not temperatures" in told
+    assert "1 photos hold raw data, perhaps temperatures, in a form that is not read" in told
+    dji_jpeg(tmp_path, counts)
+    told = " ".join(read_survey(tmp_path).notes)
+    assert "palette" not in told and "raw data" not in told

@@ -40,7 +40,9 @@ from skyquilt.photos.metadata import (
 from skyquilt.photos.pixels import read_tiff
 from skyquilt.photos.shutter import find_shutter
 from skyquilt.photos.thermal import (
+    UNREAD,
     ThermalFrame,
+    has_raw_data,
     like_reflectance,
     stated_scale,
     stated_unit,
@@ -188,7 +190,9 @@ def _photo(path: Path, name: str, header: Header, thermal_unit: str | None) -> P
     )
     rolling = _rolling(header, lens.sensor)
     seen = (*lens.notes, frame.note if frame else "", *place_notes, *angle_notes, *yaw_notes)
-    more = _ignoring(lambda: _other_notes(header, lens), lambda: (), "editing", strange)
+    more = _ignoring(
+        lambda: _other_notes(header, lens, read=frame is not None), lambda: (), "editing", strange
+    )
     return Photo(
         name=name,
         path=path,
@@ -357,11 +361,12 @@ def _broken_notes(header: Header) -> tuple[str, ...]:
     return exif, xmp
 
 
-def _other_notes(header: Header, lens: _Lens) -> tuple[str, ...]:
+def _other_notes(header: Header, lens: _Lens, *, read: bool) -> tuple[str, ...]:
     time = read_time(header.exif, header.xmp)
     guess = _focal_note(lens.focal.source, header.exif.text(tag.MODEL))
     untimed = "" if time else "It has no capture time."
-    return *header.notes, untimed, guess, _edit_note(header)
+    raw = UNREAD if not read and header.jpeg is not None and has_raw_data(header.jpeg) else ""
+    return *header.notes, raw, untimed, guess, _edit_note(header)
 
 
 def _focal_note(source: str, model: str) -> str:

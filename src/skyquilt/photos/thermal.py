@@ -30,10 +30,14 @@ _LARGEST = 1e9
 """Values beyond this are fillings, too."""
 _KELVIN_PER = {"kelvin": 1.0, "decikelvin": 0.1, "centikelvin": 0.01}
 _CELSIUS_PER = {"celsius": 1.0, "decicelsius": 0.1, "centicelsius": 0.01, "fahrenheit": 5 / 9}
+_LEAST_PX = 80 * 60
+"""Pixels of the smallest thermal sensors."""
 UNSTATED = "no unit is stated (set it with --thermal-unit)"
 """Part of the note on a frame whose unit follows from its values."""
 UNFIT = "fits no unit of temperature"
 """The same where none does."""
+UNREAD = "It holds raw data in a form that is not read; its colours are."
+"""Note on a JPEG with segments like those in which DJI keeps counts."""
 STATED = "as stated by the file or --thermal-unit."
 """The end of the note on a frame whose unit is stated."""
 _STATED = re.compile(
@@ -112,6 +116,13 @@ def _dji(jpeg: JpegHeader) -> ThermalFrame | None:
         "degrees need the manufacturer's library, and the palette contains no measurements."
     )
     return ThermalFrame(values=counts.astype(np.float32), unit="counts", note=note)
+
+
+def has_raw_data(jpeg: JpegHeader) -> bool:
+    """Whether a JPEG holds as many bytes beside its pixels, in APP3 segments, as counts of a small
+    thermal sensor need.
+    """
+    return len(jpeg.joined(APP3)) >= 2 * _LEAST_PX
 
 
 def stated_unit(text: str) -> Stored:

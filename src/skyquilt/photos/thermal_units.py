@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 from skyquilt.model.photo import Photo, RejectedPhoto, Stored
-from skyquilt.photos.thermal import STATED, UNFIT, UNSTATED
+from skyquilt.photos.thermal import STATED, UNFIT, UNREAD, UNSTATED
 
 _FEW = 0.2
 """Share of the frames of a flight up to which those that fit no unit are exceptions (a fire)."""
@@ -85,4 +85,18 @@ def unit_notes(photos: Sequence[Photo]) -> Iterator[str]:
         yield (
             f"{len(untold)} photos have one band of 16 bits or more and state no unit: they are"
             " mapped as brightness; if they are temperatures, give --thermal-unit."
+        )
+    palettes = sum(p.band == "thermal" and not p.unit and p.dtype == "uint8" for p in photos)
+    if palettes:
+        yield (
+            f"{palettes} thermal photos hold a palette's colours or greys, not temperatures: a map"
+            " of them shows where it is warmer, not how warm. For temperatures, give the camera's"
+            " radiometric files (R-JPEG of FLIR, or TIFF)."
+        )
+    unread = sum(UNREAD in p.notes for p in photos)
+    if unread:
+        yield (
+            f"{unread} photos hold raw data, perhaps temperatures, in a form that is not read (only"
+            " those of FLIR and DJI are); their colours are mapped. Convert them to TIFF with the"
+            " maker's program for a map of temperatures."
         )

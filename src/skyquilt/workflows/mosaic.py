@@ -395,6 +395,7 @@ def _metrics(
             looks={**seams.looks, "tone_residual": tone},
             conflicts=conflicts(aligned.photos, aligned.priors, alignment),
             warnings=[
+                *aligned.found.warnings,
                 *aligned.links.notes,
                 *contradictions(aligned.priors, alignment),
                 *tilt_warnings(aligned.priors, alignment),

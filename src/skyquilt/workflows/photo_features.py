@@ -20,6 +20,7 @@ from skyquilt.errors import NoPhotosError, OutputError, PhotoFailedError, Unread
 from skyquilt.imaging.grey import detail, halved, shrink, to_grey8
 from skyquilt.model.features import Features
 from skyquilt.model.photo import Photo, RejectedPhoto
+from skyquilt.ortho.palettes import palette_notes
 from skyquilt.outside import out_of_memory
 from skyquilt.photos.kept_frames import kept_frame
 from skyquilt.photos.pixels import decode_jpeg, lost, read_color
@@ -80,6 +81,11 @@ class FeaturedPhotos:
     def features(self) -> Sequence[Features]:
         """Features per photo; read when asked for, so that memory does not hold those of all."""
         return _FeaturesOf(self)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences on photos that do not belong in one map."""
+        return palette_notes(self.photos, self.thumbnails(range(len(self.photos))))
 
     def detail(self, photo: int) -> NDArray[np.float32]:
         """How sharp the picture of a photo (index) is in its cells."""
