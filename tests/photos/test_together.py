@@ -1,5 +1,6 @@
 """Who was taken together: names, times, and what speaks against them."""
 
+from dataclasses import replace
 from datetime import datetime, timedelta
 from pathlib import Path
 
@@ -54,3 +55,19 @@ def test_equal_names_of_another_flight_are_chance():
     assert (
         len(taken_together(a, [photo(f"SIM_{k}.jpg", east_m=10.0 * k + 1) for k in range(4)])) == 4
     )
+
+
+def test_of_a_wide_and_a_zoom_camera_the_wide_one_counts():
+    """All three files of one trigger have the same number and time; the zoom's may show no more
+    than a part of the thermal picture.
+    """
+    zoom = Focal(px=3000, sigma_px=70, source="guess")
+    wide = [photo(f"DJI_{k:04d}_W.JPG", 3.0 * k) for k in range(4)]
+    near = [
+        replace(photo(f"DJI_{k:04d}_Z.JPG", 3.0 * k), focal=zoom, camera_key="z") for k in range(4)
+    ]
+    heat = [photo(f"DJI_{k:04d}_T.JPG", 3.0 * k) for k in (3, 1)]
+    unnamed = [photo(f"heat{name}.tif", 3.0 * k) for name, k in zip("ab", (3, 1), strict=True)]
+    for b in (heat, unnamed):
+        assert taken_together([*near, *wide], b) == [(7, 0), (5, 1)]
+        assert taken_together([*wide, *near], b) == [(3, 0), (1, 1)]

@@ -23,29 +23,44 @@ def taken_together(a: Sequence[Photo], b: Sequence[Photo]) -> list[tuple[int, in
     """Pairs (index of a, index of b), each photo in at most one, by ascending index of b.
 
     Photos are paired by equal numbers in the names, where neither times nor positions contradict;
-    photos without a partner by name are paired by the nearest time.
+    photos without a partner by name are paired by the nearest time. Of photos of several cameras
+    taken at once (wide and zoom), the one with the widest view counts.
     """
     named: dict[tuple[str, ...], list[int]] = {}
     for i, photo in enumerate(a):
         named.setdefault(_numbers(photo), []).append(i)
     found: dict[int, int] = {}
     for j, photo in enumerate(b):
-        same = named.get(_numbers(photo), []) if _numbers(photo) else []
+        same = _widest(a, named.get(_numbers(photo), [])) if _numbers(photo) else []
         if len(same) == 1 and same[0] not in found.values() and _possible(a[same[0]], photo):
             found[j] = same[0]
     left = [i for i in range(len(a)) if i not in found.values()]
     for j, photo in enumerate(b):
-        gaps = [(gap, i) for i in left if (gap := _gap_s(a[i], photo)) is not None]
+        gaps = [(gap, _narrow(a[i]), i) for i in left if (gap := _gap_s(a[i], photo)) is not None]
         if (
             j in found
             or not gaps
             or min(gaps)[0] > SECONDS
-            or not _possible(a[min(gaps)[1]], photo)
+            or not _possible(a[min(gaps)[-1]], photo)
         ):
             continue
-        found[j] = min(gaps)[1]
+        found[j] = min(gaps)[-1]
         left.remove(found[j])
     return [(found[j], j) for j in sorted(found)]
+
+
+def _narrow(photo: Photo) -> float:
+    """Focal length over the longer side: more for a narrower view."""
+    return photo.focal.px / max(photo.width, photo.height)
+
+
+def _widest(a: Sequence[Photo], same: Sequence[int]) -> list[int]:
+    """Of photos (indices) with one number, that with the widest view, where each is of another
+    camera; all of them otherwise.
+    """
+    if len({a[i].camera_key for i in same}) < len(same):
+        return list(same)
+    return [min(same, key=lambda i: (_narrow(a[i]), i))] if same else []
 
 
 def _numbers(photo: Photo) -> tuple[str, ...]:

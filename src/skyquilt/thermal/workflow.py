@@ -28,7 +28,7 @@ from skyquilt.coregistration.workflow import residual
 from skyquilt.engine.clock import Clock
 from skyquilt.errors import PhotoFailedError, RefusedError, UsageError
 from skyquilt.model.event import Event, Note, Result, StageFinished, StageStarted
-from skyquilt.model.photo import Survey
+from skyquilt.model.photo import RejectedPhoto, Survey
 from skyquilt.model.registration import RefusedRegistration, Registration
 from skyquilt.ortho.radiometry import recorded_tags, value_figures
 from skyquilt.photos.together import taken_together
@@ -76,6 +76,21 @@ def iter_thermal(
         heats, said = _without_clips(heats, Path(thermal))
         yield Note(text=said, warning=True)
     given = read_input(photos, settings.input)
+    given, fewer = _of_spectrum(given, "visible", "the visual map")
+    heats, more = _of_spectrum(heats, "thermal", "the thermal map")
+    yield from (Note(text=text) for text in (*fewer, *more))
+    if {p.digest for p in heats.survey.photos} <= {p.digest for p in given.survey.photos}:
+        known = any(p.band == "thermal" for p in heats.survey.photos)
+        raise UsageError(
+            f"the photos of --thermal {thermal} are those of the visual map, and "
+            + (
+                "all are thermal; for a map of them alone, leave --thermal out"
+                if known
+                else "none is known to be thermal; give the folder of the thermal photos"
+            )
+        )
+    if asked.input.thermal_unit is None and not any(p.stored for p in heats.survey.photos):
+        heated = heated.changed(thermal_unit=None)  # it would be called idle
     refuse_apart(given.survey.photos, heats.survey.photos)
     if not any(p.band == "thermal" for p in heats.survey.photos):
         yield Note(
@@ -118,6 +133,19 @@ def _without_clips(heats: SurveyInput, folder: Path) -> tuple[SurveyInput, str]:
         )
     survey = replace(heats.survey, clips=())
     return replace(heats, survey=survey), f"videos in {folder} were left out: {names}"
+
+
+def _of_spectrum(given: SurveyInput, band: str, map_: str) -> tuple[SurveyInput, tuple[str, ...]]:
+    """The photos of one spectrum of a folder that holds both, as drones with two cameras write it,
+    and a sentence on the others; all where none is of it.
+    """
+    others = [p for p in given.survey.photos if p.band != band]
+    if not others or len(others) == len(given.survey.photos):
+        return given, ()
+    reason = f"it is a {others[0].band} photo, and {map_} shows the {band} ones"
+    kept = given.without([RejectedPhoto(name=p.name, reason=reason) for p in others])
+    named = f"{len(others)} {others[0].band} photos in the folder, such as {others[0].name},"
+    return kept, (f"{named} are left out of {map_}",)
 
 
 def _settings_of_both(asked: MosaicSettings) -> tuple[MosaicSettings, MosaicSettings]:
