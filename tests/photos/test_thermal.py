@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import tifffile
 
+from skyquilt.errors import NoPhotosError
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.photos.flir import FlirCamera
 from skyquilt.photos.pixels import read_color, read_gray
@@ -537,3 +538,13 @@ def test_colours_without_temperatures_are_told(tmp_path):
     dji_jpeg(tmp_path, counts)
     told = " ".join(read_survey(tmp_path).notes)
     assert "palette" not in told and "raw data" not in told
+
+
+def test_copying_again_is_advised_for_damaged_files_only(tmp_path):
+    path = tmp_path / "t.tif"
+    tifffile.imwrite(path, np.full((60, 80), 29515, np.uint16))
+    with pytest.raises(NoPhotosError, match=r"degrees Celsius\)\.$"):
+        read_survey(tmp_path, thermal_unit="celsius")
+    path.write_bytes(path.read_bytes()[:900])
+    with pytest.raises(NoPhotosError, match=r"Copy them again\.$"):
+        read_survey(tmp_path, thermal_unit="celsius")

@@ -57,12 +57,12 @@ def test_compare_reads_values_as_told_in_every_run(frames, tmp_path, monkeypatch
 
     monkeypatch.setattr(compare, "make_map", overhearing)
     settings = CompareSettings(
-        mosaic=MosaicSettings(thermal_unit="decikelvin"), variants=("position", "image")
+        mosaic=MosaicSettings(thermal_unit="counts"), variants=("position", "image")
     )
     *_, last = iter_compare(frames, tmp_path / "out", settings)
     assert last.metrics["methods"].keys() == {"position", "image"}
     told = [e.text for e in overheard if isinstance(e, Note) and e.text.startswith("Thermal TIFFs")]
-    assert told == ["Thermal TIFFs are read as decikelvin (2)."] * 2
+    assert told == ["Thermal TIFFs are read as counts (2)."] * 2
 
 
 def test_a_live_map_keeps_reading_as_told(frames, tmp_path):
@@ -88,5 +88,5 @@ def test_a_live_map_keeps_reading_as_told(frames, tmp_path):
 
 
 def test_a_unit_that_is_none_is_refused():
-    with pytest.raises(UsageError, match="--thermal-unit 'fahrenheit' is not one of auto, celsius"):
-        LiveSettings(thermal_unit="fahrenheit")
+    with pytest.raises(UsageError, match="--thermal-unit 'rankine' is not one of auto, celsius"):
+        LiveSettings(thermal_unit="rankine")

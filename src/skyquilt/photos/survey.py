@@ -45,6 +45,8 @@ _OTHER_PICTURES = frozenset(
 """Endings of pictures in formats that are not read."""
 RUN_MARKS = frozenset({"run.toml", "live.db", ".skyquilt"})
 """What the folder of an earlier run or of a live map holds, each one or another of these."""
+_DAMAGED = "truncated", "broken", "damaged", "empty", "cannot be read", "cannot be decoded"
+"""Words in the reasons of files that another copy may not have."""
 _SIDE_NAMES = frozenset({"geo.txt", "gcp_list.txt"})
 
 
@@ -305,9 +307,10 @@ def _nothing_sentence(
         return f"There is no photo in {where} that can be found: {_closed_note(found)[0]}"
     if rejected:
         reasons = "; ".join(f"{r.name}: {r.reason}" for r in rejected[:5])
+        damaged = any(word in r.reason for r in rejected for word in _DAMAGED)
         return (
             f"None of the {len(rejected)} {'image and video' if found.clips else 'image'} files in"
-            f" {where} can be read ({reasons}). Copy them again."
+            f" {where} can be read ({reasons}).{' Copy them again.' if damaged else ''}"
         )
     others = (*found.ignored, *(n for n, _ in found.clips)) if not clips else found.ignored
     held = f"only other files ({sentence_of(others)})" if others else "nothing"
