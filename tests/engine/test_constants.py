@@ -58,6 +58,10 @@ IN_NO_KEY = {
         "the numbers that the formats TIFF and PNG give to tags",
     ),
     **dict.fromkeys(
+        ("_MOST_PAGES", "_SAME_SHAPE", "_REDUCED", "_MASK"),
+        "which page of a TIFF is the photo changes with the version only, which is in the keys",
+    ),
+    **dict.fromkeys(
         ("MOST_CHUNKS", "MOST_STRIPS", "_LEAST_FOCAL", "_MOST"),
         "limits of files that are refused: they shape no result",
     ),
@@ -88,7 +92,7 @@ IN_NO_KEY = {
 BY_VALUE = {
     f"skyquilt.ortho.{name}": "what photos show badly is in the key of the seams, by value"
     for name in ("sharpness", "spoilt")
-}
+} | {"skyquilt.ortho.palettes": "what is told of palettes is told anew by every run"}
 """Modules whose constants no method's key holds, and why that is right."""
 
 

@@ -548,3 +548,15 @@ def test_copying_again_is_advised_for_damaged_files_only(tmp_path):
     path.write_bytes(path.read_bytes()[:900])
     with pytest.raises(NoPhotosError, match=r"Copy them again\.$"):
         read_survey(tmp_path, thermal_unit="celsius")
+
+
+def test_pixels_read_in_another_unit_are_others(tmp_path):
+    """A folder mapped again with another --thermal-unit took small pictures in the first unit from
+    the store: offsets found in counts were added to degrees, up to 64.
+    """
+    tifffile.imwrite(tmp_path / "t.tif", np.full((60, 80), 29515, np.uint16))
+    units = ("counts", "centikelvin", None)
+    photos = [read_photo(tmp_path / "t.tif", thermal_unit=u) for u in units]
+    assert len({p.pixels_key for p in photos}) == 3
+    said = read_photo(tmp_path / "t.tif", thermal_unit="auto")
+    assert said.pixels_key == photos[1].pixels_key

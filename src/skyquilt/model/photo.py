@@ -222,7 +222,8 @@ class Photo:
     @property
     def pixels_key(self) -> str:
         """Stands for its pixels as they are read: the digest of its file, and what is mended."""
-        return self.digest if self.faults is None else f"{self.digest}-{self.faults.key}"
+        faults = "" if self.faults is None else self.faults.key
+        return "-".join(part for part in (self.digest, self.stored, faults) if part)
 
     @property
     def shows_a_band(self) -> bool:

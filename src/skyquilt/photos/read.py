@@ -365,7 +365,9 @@ def _other_notes(header: Header, lens: _Lens, *, read: bool) -> tuple[str, ...]:
     time = read_time(header.exif, header.xmp)
     guess = _focal_note(lens.focal.source, header.exif.text(tag.MODEL))
     untimed = "" if time else "It has no capture time."
-    raw = UNREAD if not read and header.jpeg is not None and has_raw_data(header.jpeg) else ""
+    jpeg = header.jpeg
+    unread = not read and jpeg is not None and jpeg.radiometric and has_raw_data(jpeg)
+    raw = UNREAD if unread else ""
     return *header.notes, raw, untimed, guess, _edit_note(header)
 
 
