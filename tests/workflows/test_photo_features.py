@@ -1,6 +1,7 @@
 """What goes wrong with one photo, and what is no fault of it."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,9 +9,10 @@ import pytest
 from skyquilt.engine.store import Store
 from skyquilt.engine.workers import HERE
 from skyquilt.matching.sift import Sift
+from skyquilt.model.photo import Focal, Photo
 from skyquilt.photos.read import read_photo
 from skyquilt.workflows.artefacts import REGISTRY
-from skyquilt.workflows.photo_features import find_features
+from skyquilt.workflows.photo_features import FeaturedPhotos, find_features, of_one_kind
 from tests.photos.conftest import jpeg_bytes
 
 
@@ -29,3 +31,19 @@ def test_a_full_memory_is_no_fault_of_the_photos(tmp_path):
     photos = [photo, replace(photo, digest="other")]
     with pytest.raises(MemoryError, match=r"to read one\.jpg"):
         list(find_features(photos, pixels, Sift(), store, HERE))
+
+
+def test_degrees_and_counts_are_not_one_kind():
+    """Frames of a camera in degrees and of one in counts were joined in one map "in degrees"."""
+    common = dict(path=Path("a"), digest="0", width=640, height=512, channels=1, dtype="float32")
+    common |= dict(band="thermal", position=None, attitude=None, time=None, camera_key="c")
+    focal = Focal(px=700.0, sigma_px=70.0, source="guess")
+    units = ["celsius", "counts", "celsius"]
+    photos = [Photo(name=f"{k}", unit=u, focal=focal, **common) for k, u in enumerate(units)]
+    found = of_one_kind(
+        FeaturedPhotos(photos=tuple(photos), number=(0, 1, 2), looks=None, rejected=())
+    )
+    assert [p.name for p in found.photos] == ["0", "2"]
+    (left,) = found.rejected
+    assert left.name == "1" and "thermal in counts" in left.reason
+    assert "thermal in celsius" in left.reason
