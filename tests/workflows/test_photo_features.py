@@ -35,8 +35,21 @@ def test_a_full_memory_is_no_fault_of_the_photos(tmp_path):
 
 def test_degrees_and_counts_are_not_one_kind():
     """Frames of a camera in degrees and of one in counts were joined in one map "in degrees"."""
-    common = dict(path=Path("a"), digest="0", width=640, height=512, channels=1, dtype="float32")
-    common |= dict(band="thermal", position=None, attitude=None, time=None, camera_key="c")
+    common = {
+        "path": Path("a"),
+        "digest": "0",
+        "width": 640,
+        "height": 512,
+        "channels": 1,
+        "dtype": "float32",
+    }
+    common |= {
+        "band": "thermal",
+        "position": None,
+        "attitude": None,
+        "time": None,
+        "camera_key": "c",
+    }
     focal = Focal(px=700.0, sigma_px=70.0, source="guess")
     units = ["celsius", "counts", "celsius"]
     photos = [Photo(name=f"{k}", unit=u, focal=focal, **common) for k, u in enumerate(units)]
