@@ -10,7 +10,7 @@ from scipy import sparse
 
 from skyquilt.simulate.grid import Doubles, Floats, Grid
 from skyquilt.simulate.noise import Noise
-from skyquilt.simulate.terrain import Terrain, shaped, stands
+from skyquilt.simulate.terrain import Terrain, shaped, stands, stands_anywhere
 
 _POND_RES = 0.25
 _BANK_M = 9.0
@@ -88,6 +88,8 @@ class Ground:
 
     def stands(self, x: float, y: float) -> bool:
         """Whether a house, a tree or a target stands firmly there: not in a lake or on a cliff."""
+        if stands_anywhere(self.kind):
+            return True
         around = Grid(left=x - 2.5, top=y + 2.5, res=1.0, width=5, height=5)
         return stands(self.kind, self.hills(around), around)
 

@@ -21,6 +21,8 @@ _CELL = 16
 _LEVEL_M = 0.35  # height between two levels of the bracketing march
 _STEP_PX = 2.0  # raster px between two samples of the exact march
 _MAX_STEPS = 128
+_WORTH = 0.75  # rays are taken out of the march when this share of them goes on
+_TOGETHER = 1 << 15  # rays that march together: their numbers stay in the processor's cache
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -35,10 +37,6 @@ class Rays:
     def at(self, z: Floats) -> Floats:
         """Raster pixels (..., 2) at heights (...)."""
         return self.start - z[..., None] * self.slope
-
-    def take(self, mask: NDArray[np.bool_]) -> "Rays":
-        """The rays under a mask, flat."""
-        return Rays(start=self.start[mask], slope=self.slope[mask])
 
     def coarse(self) -> "Rays":
         """One ray per cell, at its centre."""
@@ -130,29 +128,53 @@ def _reach(rays: Rays) -> int:
     return int(np.clip(np.ceil(0.6 * float(max(apart)) / _CELL) + 1, 2, 40))
 
 
-def _march(raster: Floats, rays: Rays, above: Floats, below: Floats, steps: int) -> Floats:
+def _march(raster: Floats, lines: Floats, above: Floats, below: Floats, steps: int) -> Floats:
     """Heights (n,) of first hits between two heights (n,) per ray: even steps, then false
     position.
+
+    `lines` (4, n): column and row of each ray at height 0, and by how much they fall per metre.
     """
     z_over, z_under = above.copy(), below.copy()
     f_over = np.full_like(above, -1e-3)
     f_under = np.full_like(above, 1e-3)
     step = (above - below) / np.float32(steps)
+    # those that go on: their numbers, lines, begin and step, whether they have had no hit so far
+    left, going, begin = np.arange(len(above)), lines, above
     open_ = np.ones(above.shape, dtype=bool)
+    z, f = above, f_over
     for k in range(1, steps + 1):
-        z = above - np.float32(k) * step
-        f = sample(raster, rays.at(z)) - z
-        hit = open_ & (f >= 0)
-        z_under[hit], f_under[hit] = z[hit], f[hit]
-        open_ &= ~hit
-        z_over[open_], f_over[open_] = z[open_], f[open_]
-        if not open_.any():
-            break
-    return _polish(raster, rays, z_over, z_under, f_over, f_under)
+        z_before, f_before, z = z, f, begin - np.float32(k) * step
+        f = _surface(raster, going, z) - z
+        ended = np.flatnonzero(open_ & (f >= 0))
+        z_under[left[ended]], f_under[left[ended]] = z[ended], f[ended]
+        z_over[left[ended]], f_over[left[ended]] = z_before[ended], f_before[ended]
+        open_[ended] = False
+        count = np.count_nonzero(open_)
+        if not count:
+            return _polish(raster, lines, z_over, z_under, f_over, f_under)
+        if count < _WORTH * len(left):
+            left, going, begin = left[open_], going[:, open_], begin[open_]
+            step, z, f, open_ = step[open_], z[open_], f[open_], np.ones(count, dtype=bool)
+    z_over[left[open_]], f_over[left[open_]] = z[open_], f[open_]
+    return _polish(raster, lines, z_over, z_under, f_over, f_under)
+
+
+def _surface(raster: Floats, lines: Floats, z: Floats) -> Floats:
+    """Heights (n,) of the raster where rays have the heights z (n,)."""
+    x, y = lines[0] - z * lines[2], lines[1] - z * lines[3]
+    count, wide = len(z), 1024  # lists as rows of this length: images have at most 32767
+    rows = -(-count // wide)
+    if rows * wide > count:
+        x, y = (np.concatenate([a, np.zeros(rows * wide - count, np.float32)]) for a in (x, y))
+    values = cv2.remap(
+        raster, x.reshape(rows, wide), y.reshape(rows, wide), cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )  # fmt: skip
+    return np.asarray(values).reshape(-1)[:count]
 
 
 def _polish(
-    raster: Floats, rays: Rays, z_over: Floats, z_under: Floats, f_over: Floats, f_under: Floats
+    raster: Floats, lines: Floats, z_over: Floats, z_under: Floats, f_over: Floats, f_under: Floats
 ) -> Floats:
     """Refines the intersection between heights above and below the surface."""
     for k in range(5):
@@ -162,7 +184,7 @@ def _polish(
             else np.clip(f_over / (f_over - f_under - 1e-9), 0.02, 0.98)
         )
         z = z_over + (z_under - z_over) * share
-        f = sample(raster, rays.at(z)) - z
+        f = _surface(raster, lines, z) - z
         hit = f >= 0
         z_under, f_under = np.where(hit, z, z_under), np.where(hit, f, f_under)
         z_over, f_over = np.where(hit, z_over, z), np.where(hit, f_over, f)
@@ -179,12 +201,16 @@ def first_hits(raster: Floats, rays: Rays) -> tuple[Floats, Floats]:
     above, below = _bracket(raster, coarse)
     travel = (above - below) * np.linalg.norm(coarse.slope, axis=-1) / _STEP_PX
     steps = 2 ** np.ceil(np.log2(np.clip(travel, 1, _MAX_STEPS))).astype(np.int32)
-    above, below, steps = (_spread(a, h, w) for a in (above, below, steps))
-    heights = np.empty((h, w), dtype=np.float32)
+    above, below, steps = (_spread(a, h, w).ravel() for a in (above, below, steps))
+    lines = np.stack([a[..., i].ravel() for a in (rays.start, rays.slope) for i in (0, 1)])
+    heights = np.empty(h * w, dtype=np.float32)
     for count in np.unique(steps):
-        mask = steps == count
-        heights[mask] = _march(raster, rays.take(mask), above[mask], below[mask], int(count))
-    return rays.at(heights), heights
+        alike = np.flatnonzero(steps == count)
+        for k in range(0, len(alike), _TOGETHER):
+            some = alike[k : k + _TOGETHER]
+            heights[some] = _march(raster, lines[:, some], above[some], below[some], int(count))
+    hits = np.stack([lines[i] - heights * lines[2 + i] for i in (0, 1)], axis=-1)
+    return hits.reshape(h, w, 2), heights.reshape(h, w)
 
 
 def _spread(cells: NDArray[Any], height: int, width: int) -> NDArray[Any]:

@@ -64,12 +64,17 @@ def deck(grid: Grid) -> NDArray[np.bool_]:
     return (np.abs(grid.ys) < DECK_M)[:, None] & (np.abs(grid.xs) < 45.0)[None, :]
 
 
+def stands_anywhere(kind: Terrain) -> bool:
+    """Whether houses, trees and targets can stand everywhere, whatever the heights."""
+    return kind in ("landscape", "bare", "town")
+
+
 def stands(kind: Terrain, heights: Floats, grid: Grid) -> bool:
     """Whether houses, trees and targets can stand on cells whose ground has these heights (h, w),
     m: not in a lake, on a bridge or on a cliff.
     """
     match kind:
-        case "landscape" | "bare" | "town":
+        case _ if stands_anywhere(kind):
             return True
         case "shore" if float(heights.min()) <= WATER_M:
             return False
