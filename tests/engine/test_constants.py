@@ -172,6 +172,36 @@ def test_another_constant_is_another_key(artefact, constant, monkeypatch):
     assert KEYS[artefact]() != before
 
 
+@pytest.mark.parametrize(
+    ("constant", "change", "back"),
+    [
+        (7, None, None),
+        ({"a": [1, 2]}, lambda v: v["a"].append(3), lambda v: v["a"].pop()),
+        ({"a": 1}, lambda v: v.update(b=2), lambda v: v.pop("b")),
+        ([1.5, 2.5], list.reverse, list.reverse),
+        ({4, 5}, lambda v: v.add(6), lambda v: v.remove(6)),
+        (np.arange(4.0), lambda v: v.__setitem__(2, 9.0), lambda v: v.__setitem__(2, 2.0)),
+        (({"a": 1}, 2), lambda v: v[0].update(a=3), lambda v: v[0].update(a=1)),
+    ],
+    ids=str,
+)
+def test_a_constant_that_is_changed_in_place_is_another_key(monkeypatch, constant, change, back):
+    """Keys are remembered as long as all constants are what they were, not only the same objects."""
+    module = sys.modules["skyquilt.ortho.compose"]
+    name = next(n for n in vars(module) if f"{module.__name__}.{n}" in constants_of(Composer))
+    before = digest(Composer)
+    monkeypatch.setattr(module, name, constant)
+    first = digest(Composer)
+    assert first == digest(Composer) != before
+    if change:
+        change(constant)
+        assert digest(Composer) != first
+        back(constant)
+        assert digest(Composer) == first
+    monkeypatch.undo()
+    assert digest(Composer) == before
+
+
 def test_code_in_tables_counts_by_name():
     assert is_data({"a": (len.__class__, photo)})
     assert not is_data([object()])

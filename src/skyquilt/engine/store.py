@@ -12,6 +12,7 @@ import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from operator import is_
 from pathlib import Path, PurePath
 from types import FunctionType
 from typing import Any, TypeVar
@@ -79,11 +80,92 @@ def _plain_data(value: Any, inside: Callable[[Any], Any]) -> Any:
     raise TypeError(f"a key cannot be made of {type(value).__name__}: {value!r:.80}")
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Counted:
+    """The number of a module's constants, and what tells whether it still holds."""
+
+    values: dict[str, Any]
+    """The constants by name."""
+    copies: list[tuple[Any, Any]]
+    """Containers that can be changed in place, each with a copy."""
+    others: list[tuple[Any, str]]
+    """What else can be changed in place, such as arrays, each with its text."""
+    number: str
+    """Hash (hex) of all."""
+
+    def holds(self, values: dict[str, Any]) -> bool:
+        """Whether these are the same constants with the same content."""
+        return (
+            self.values.keys() == values.keys()
+            and all(map(is_, self.values.values(), values.values()))
+            and all(value == copy for value, copy in self.copies)
+            and all(_text(value) == text for value, text in self.others)
+        )
+
+
+_counted: dict[str, _Counted] = {}  # by module
+
+
 def _constants(thing: type | FunctionType) -> str:
     """One number for all constants that a class or a function computes with."""
-    values = {name: _constant(v) for name, v in constants_of(thing).items()}
-    content = json.dumps(values, sort_keys=True).encode()
-    return hashlib.blake2b(content, digest_size=16).hexdigest()
+    values = constants_of(thing)
+    known = _counted.get(thing.__module__)
+    if known is not None and known.holds(values):
+        return known.number
+    parts = [f"{json.dumps(name)}: {_text(v)}" for name, v in sorted(values.items())]
+    content = f"{{{', '.join(parts)}}}".encode()
+    number = hashlib.blake2b(content, digest_size=16).hexdigest()
+    counted = _Counted(values=values, copies=[], others=[], number=number)
+    for value in values.values():
+        if id(value) not in _texts:
+            try:
+                counted.copies.append((value, _copied(value)))
+            except TypeError:
+                counted.others.append((value, _text(value)))
+    _counted[thing.__module__] = counted
+    return number
+
+
+_texts: dict[int, tuple[Any, str]] = {}  # by identity: constants that cannot change, as JSON
+
+
+def _text(value: Any) -> str:
+    """A constant as JSON."""
+    known = _texts.get(id(value))
+    if known is not None:  # it is held there, so that nothing else has this identity
+        return known[1]
+    text = json.dumps(_constant(value), sort_keys=True)
+    if _fixed(value):
+        _texts[id(value)] = value, text
+    return text
+
+
+def _fixed(value: Any) -> bool:
+    """Whether a constant's content cannot change while it is the same object."""
+    if isinstance(value, tuple | frozenset):
+        return all(map(_fixed, value))
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        frozen = type(value).__dataclass_params__.frozen  # type: ignore[attr-defined]
+        return frozen and all(_fixed(getattr(value, f.name)) for f in dataclasses.fields(value))
+    plain = type | FunctionType | np.generic | bool | int | float | complex | str | bytes
+    return value is None or isinstance(value, plain)
+
+
+def _copied(value: Any) -> Any:
+    """A copy that equals the value until that is changed in place.
+
+    Raises:
+        TypeError: there is none that a comparison tells of, as of arrays.
+    """
+    if _fixed(value):
+        return value
+    if type(value) is dict:
+        return {k: _copied(v) for k, v in value.items()}
+    if type(value) is list:
+        return [_copied(v) for v in value]
+    if type(value) is set:
+        return set(value)
+    raise TypeError(type(value).__name__)
 
 
 def _constant(value: Any) -> Any:

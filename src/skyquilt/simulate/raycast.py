@@ -140,7 +140,7 @@ def _march(raster: Floats, lines: Floats, above: Floats, below: Floats, steps: i
     step = (above - below) / np.float32(steps)
     # those that go on: their numbers, lines, begin and step, whether they have had no hit so far
     left, going, begin = np.arange(len(above)), lines, above
-    open_ = np.ones(above.shape, dtype=bool)
+    open_: NDArray[np.bool_] = np.ones(len(above), dtype=bool)
     z, f = above, f_over
     for k in range(1, steps + 1):
         z_before, f_before, z = z, f, begin - np.float32(k) * step
@@ -170,7 +170,7 @@ def _surface(raster: Floats, lines: Floats, z: Floats) -> Floats:
         raster, x.reshape(rows, wide), y.reshape(rows, wide), cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
     )  # fmt: skip
-    return np.asarray(values).reshape(-1)[:count]
+    return np.asarray(values, np.float32).reshape(-1)[:count]
 
 
 def _polish(
