@@ -58,6 +58,7 @@ def test_a_small_survey_waits_for_nothing_it_does_not_need():
     assert out.stdout.strip() == ""
 
 
+@pytest.mark.slow
 def test_a_mosaic_imports_nothing_of_the_papers_nor_of_viewer_and_exports():
     """Not even while it runs: their methods are named by strings, from above."""
     code = (

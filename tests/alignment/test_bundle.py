@@ -458,7 +458,8 @@ def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-@pytest.mark.parametrize("noise", [0.15, pytest.param(0.3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [0.15, 0.3])
 def test_the_deviations_of_a_calibration_are_as_large_as_its_errors(noise):
     """Keypoints are taken to err by more than these do: the deviations follow what they show."""
     errors = lens_errors(noise=noise)

@@ -143,7 +143,8 @@ def test_each_camera_has_its_own_order():
     assert moved[1::2] == told[1::2]
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
 def test_a_flight_with_late_positions_is_placed_as_with_right_ones(seed):
     flight = Slanting([(x - 45, y - 37, z, 90.0, 0.0) for x, y, z in LINES], seed=seed)
     right = flight.aligned()

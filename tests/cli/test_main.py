@@ -341,6 +341,7 @@ def in_shell(line, *words):
     return done.returncode, done.stderr
 
 
+@pytest.mark.slow
 def test_closed_streams_change_nothing(tmp_path):
     """Without them sentences could not be written, and files would get their numbers."""
     words = ("mosaic", tmp_path, "-o", tmp_path / "out")

@@ -93,7 +93,8 @@ def drawn(grey):
     return cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(s, marks=pytest.mark.slow) for s in (2, 3))])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 2, 3])
 def test_marks_in_pictures_of_other_sizes_register_nothing(auto, seed):
     small = cv2.resize(bare(seed + 20, 0.2), None, fx=0.6, fy=0.6, interpolation=cv2.INTER_AREA)
     a, b = (Picture(values=drawn(v)) for v in (bare(seed, 0.2), small))

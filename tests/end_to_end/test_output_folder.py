@@ -24,14 +24,15 @@ from skyquilt.model.event import StageStarted
 from skyquilt.settings import MosaicSettings
 from skyquilt.workflows import flow
 from skyquilt.workflows.mosaic import STAGES, iter_mosaic
-from tests.end_to_end.conftest import leftovers, named
+from tests.end_to_end.conftest import QUICK, leftovers, named
 from tests.interrupts import hears_interrupts, worked
 
 pytestmark = pytest.mark.filterwarnings(
     "error::RuntimeWarning", "error::scipy.linalg.LinAlgWarning"
 )
 SLOWER = ("--features", "800", "--gsd", "11", "--jobs", "2")
-"""Options with which each stage lasts long enough to be interrupted."""
+"""Options with which each stage lasts long enough to be interrupted; `features` does with `QUICK`.
+"""
 RASTERS = ("mosaic.tif", "provenance.tif", "views.tif", "surface.tif")
 
 
@@ -430,11 +431,17 @@ MOMENTS = [
 ]
 
 
+def with_options(moment: tuple[str, str, int], request: pytest.FixtureRequest) -> tuple:
+    """The options for a run that is disturbed at a moment, and the undisturbed run with them."""
+    if moment[1] == "features":
+        return QUICK, request.getfixturevalue("finished")
+    return SLOWER, request.getfixturevalue("undisturbed")
+
+
 @pytest.mark.parametrize("moment", [MOMENTS[1], *map(late, (MOMENTS[0], *MOMENTS[2:]))])
-def test_ctrl_c_ends_soon_and_the_same_command_resumes(
-    mosaic, flight, tmp_path, undisturbed, moment
-):
-    running = Running(flight / "photos", tmp_path / "out", *SLOWER)
+def test_ctrl_c_ends_soon_and_the_same_command_resumes(mosaic, flight, tmp_path, request, moment):
+    options, undisturbed = with_options(moment, request)
+    running = Running(flight / "photos", tmp_path / "out", *options)
     running.until(*moment)
     code, seconds, err = running.signalled(signal.SIGINT)
     assert code == 130, err
@@ -445,7 +452,7 @@ def test_ctrl_c_ends_soon_and_the_same_command_resumes(
     )
     assert "Traceback" not in err
     assert not (tmp_path / "out" / "metrics.json").exists()
-    same_result(mosaic(flight / "photos", *SLOWER, quick=False).made().output, undisturbed)
+    same_result(mosaic(flight / "photos", *options, quick=False).made().output, undisturbed)
 
 
 @pytest.mark.parametrize("delay", [0.3, *map(late, (0.2, 0.5, 0.8))])
@@ -479,12 +486,13 @@ def test_ctrl_c_twice(flight, tmp_path):
         late(("StageStarted", "report", 1)),
     ],
 )
-def test_kill_9_and_the_same_command_resumes(mosaic, flight, tmp_path, undisturbed, moment):
-    running = Running(flight / "photos", tmp_path / "out", *SLOWER)
+def test_kill_9_and_the_same_command_resumes(mosaic, flight, tmp_path, request, moment):
+    options, undisturbed = with_options(moment, request)
+    running = Running(flight / "photos", tmp_path / "out", *options)
     running.until(*moment)
     code, _, _ = running.signalled(signal.SIGKILL)
     assert code == -signal.SIGKILL
-    told = mosaic(flight / "photos", *SLOWER, "--json", quick=False).made()
+    told = mosaic(flight / "photos", *options, "--json", quick=False).made()
     reused = {e["stage"]: e["reused"] for e in told.events if e["event"] == "StageFinished"}
     before = STAGES[1 : STAGES.index(moment[1])]
     assert all(reused[s] for s in before if s in ("features", "links", "align", "surface"))

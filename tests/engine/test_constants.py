@@ -186,7 +186,7 @@ def test_another_constant_is_another_key(artefact, constant, monkeypatch):
     ids=str,
 )
 def test_a_constant_that_is_changed_in_place_is_another_key(monkeypatch, constant, change, back):
-    """Keys are remembered as long as all constants are what they were, not only the same objects."""
+    """Keys are remembered while all constants are what they were, not the same objects only."""
     module = sys.modules["skyquilt.ortho.compose"]
     name = next(n for n in vars(module) if f"{module.__name__}.{n}" in constants_of(Composer))
     before = digest(Composer)

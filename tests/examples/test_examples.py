@@ -17,7 +17,8 @@ EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory):
     base = preset("demo")
-    small = replace(base, lens=base.lens.scaled(800, 600), route=replace(base.route, photos=6))
+    route = replace(base.route, photos=6)
+    small = replace(base, lens=base.lens.scaled(800, 600), route=route, thermal=None)
     folder = tmp_path_factory.mktemp("flight")
     for _ in simulate(small, folder):
         pass
@@ -56,6 +57,7 @@ def test_your_own_features(flight, tmp_path):
     assert all(0.02 < float(px) < 1.0 for px in re.findall(r"reprojection error ([\d.]+) px", said))
 
 
+@pytest.mark.slow
 def test_a_folder_becomes_a_map_that_fits_the_truth(flight, tmp_path):
     said = run("01_folder_to_cog.py", flight / "photos", tmp_path / "out", "15")
     assert "6 of 6 photos by bundle" in said

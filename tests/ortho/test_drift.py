@@ -3,6 +3,7 @@ alone.
 """
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -159,6 +160,7 @@ Y, X = np.mgrid[:300, :400]
 RING = (2.5 * np.exp(-(((np.hypot(X - 200, Y - 150) / 250 - 0.4) / 0.12) ** 2))).astype(np.float32)
 
 
+@cache
 def strip(count=12):
     """Frames of one straight line, 70 % overlap, with drift and noise; what is true of each."""
     views = [view(k, -24 + 4.4 * k, 0.5 * (k % 3), yaw=85 + k % 4) for k in range(count)]

@@ -117,6 +117,7 @@ def test_a_spot_on_the_lens_is_found_and_only_there():
     assert np.array_equal(spot, expected)
 
 
+@pytest.mark.slow
 def test_two_thousand_photos_take_seconds():
     alignment = flight(2000)
     details = seen(alignment)
