@@ -34,7 +34,9 @@ def test_a_fixed_camera_that_claims_to_look_straight_down(seed, monkeypatch):
     assert errors[0] == pytest.approx(errors[2], abs=0.1)
 
 
-@pytest.mark.parametrize("wrong", ["nothing", "yaws", "few", "untold"])
+@pytest.mark.parametrize(
+    "wrong", ["nothing", pytest.param("yaws", marks=pytest.mark.slow), "few", "untold"]
+)
 def test_tilts_that_are_right_stay(wrong):
     flown = Flown(4, lines=4, per_line=6, points=900, true_tilt_deg=8.0)
     if wrong == "yaws":

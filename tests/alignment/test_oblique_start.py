@@ -262,7 +262,7 @@ def test_headings_that_are_all_false_by_one_angle_are_corrected(turn):
     assert np.median(turned) < 1.0
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(s, marks=pytest.mark.slow) for s in (1, 2))])
 def test_pitch_counted_from_straight_down_is_found_by_the_pictures(seed):
     flown = Slanting(grid(2), seed=seed)
     ahead = [replace(p, yaw_deg=p.yaw_deg, pitch_deg=p.pitch_deg + 90) for p in flown.priors]

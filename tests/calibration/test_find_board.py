@@ -7,7 +7,9 @@ from skyquilt.simulate.board import Chessboard, tilted
 from tests.calibration.boards import BOARD, CHESS, LENS, frame, frontal, poses, to_truth, truth
 
 
-@pytest.mark.parametrize("number", range(5))
+@pytest.mark.parametrize(
+    "number", [0, 1, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3, 4))]
+)
 def test_a_tilted_board_before_clutter_is_found_and_counted_right(number):
     pose = poses()[number]
     view = FindBoard()("", frame(pose, seed=number), BOARD)

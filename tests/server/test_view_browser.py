@@ -291,14 +291,16 @@ def test_control_points_from_the_list_to_the_residuals(browser, site, flight, ru
     ])  # fmt: skip
     holds(page, f"document.querySelectorAll('#control li').length == {len(first)}")
     for name, (photo, px, py) in first.items():
+        page.evaluate("control.rows = []; drawLoupes()")  # those of the point before
         page.locator("#control li", has_text=name).locator("span").first.click()
         loupe = page.locator(f".loupe[data-photo='{photo}']")
         loupe.wait_for()
-        page.wait_for_timeout(1500)
         # the map is metres off, so the detail is large at first
         page.select_option("#loupes select", "300")
-        page.wait_for_timeout(1500)
         loupe.scroll_into_view_if_needed()
+        holds(
+            page, f"document.querySelector(\".loupe[data-photo='{photo}'] img\").naturalWidth > 0"
+        )
         at = page.evaluate(f"control.rows.find((r) => r.name == '{photo}')")
         box = loupe.bounding_box()
         k = box["width"] / 300
@@ -308,7 +310,6 @@ def test_control_points_from_the_list_to_the_residuals(browser, site, flight, ru
         holds(page, f"marksOf('{name}').length == 1")
         marked = page.evaluate(f"marksOf('{name}')[0]")
         assert np.hypot(marked["x"] - px, marked["y"] - py) < 1.0
-        page.wait_for_timeout(500)
         page.click("#propose")
         holds(page, "/proposed|no other photo/.test(document.querySelector('#said').textContent)")
         page.evaluate("document.querySelector('#said').textContent = ''")

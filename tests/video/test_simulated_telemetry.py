@@ -1,5 +1,6 @@
 """Telemetry of the simulator in every layout, read again, against the true path."""
 
+from dataclasses import replace
 from typing import get_args
 
 import numpy as np
@@ -14,17 +15,22 @@ from skyquilt.video.positions import places_at
 from skyquilt.video.tracks import read_track
 
 
-@pytest.mark.parametrize("layout", get_args(SrtLayout))
-def test_every_layout_is_read_as_it_was_meant(layout, tmp_path):
-    video = Video(fps=5.0, layout=layout, fixes_per_second=5.0, shift=2.0)
+@pytest.fixture(scope="module")
+def flown():
+    """The settings of a flight with a video, and all that happens in it."""
     settings = sim.FlightSettings(
         lens=Lens().scaled(480, 360),
         route=Route(photos=12, sidelap=0.4, speed=8.0),
         reporting=Reporting(gps_noise=0.0, focal_error=0.0),
-        video=video,
+        video=Video(fps=5.0, fixes_per_second=5.0, shift=2.0),
     )
-    world = sim.prepare(settings)
-    film = world.video
+    return settings, sim.prepare(settings)
+
+
+@pytest.mark.parametrize("layout", get_args(SrtLayout))
+def test_every_layout_is_read_as_it_was_meant(flown, layout, tmp_path):
+    settings, world = flown
+    video, film = replace(settings.video, layout=layout), world.video
     times = np.array([s.waypoint.time for s in film.shots])
     text = telemetry(film.reports, times, video, film.lens, settings.weather.moment)
     path = tmp_path / "FLIGHT.SRT"
