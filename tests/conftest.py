@@ -1,5 +1,6 @@
 """A small simulated flight and its mosaic, made once."""
 
+import gc
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -65,6 +66,14 @@ def finished(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The longest test begins first, so that it does not run alone after all others."""
     items.sort(key=lambda item: "test_large_survey" not in item.nodeid)
+
+
+def pytest_collection_finish() -> None:
+    """Modules and thousands of tests stay to the end: they need not be looked through for garbage
+    again and again.
+    """
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture

@@ -125,6 +125,7 @@ def test_a_file_that_vanishes_is_forgotten(watched, flight):
 
 
 def test_a_folder_that_cannot_be_read_is_named_once(watched, flight, monkeypatch):
+    monkeypatch.setattr(watching, "SCAN_TOLD_S", 0.2)
     hidden = watched.folder / "drone 2"
     hidden.mkdir()
     shutil.copyfile(flight.photos[0], hidden / "a.jpg")
@@ -136,13 +137,13 @@ def test_a_folder_that_cannot_be_read_is_named_once(watched, flight, monkeypatch
         return honest(path)
 
     monkeypatch.setattr(os, "scandir", scandir)
-    done = watched.look(1.5)
+    done = watched.look(0.6)
     told = [d for d in done if isinstance(d, Refused)]
     assert [(d.name, d.reason) for d in told] == [
         ("drone 2", "this folder cannot be read (Permission denied)")
     ]
     closed[0] = False
-    done += watched.look(2.5)
+    done += watched.look(0.6)
     assert [d.name for d in done if isinstance(d, Accepted)] == ["a.jpg"]
 
 
