@@ -18,6 +18,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -140,7 +141,9 @@ def main() -> None:
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as home:
         work = Path(home)
-        settings = skyquilt.simulate.preset("demo")
+        demo = skyquilt.simulate.preset("demo")
+        lens, route = demo.lens.scaled(800, 600), replace(demo.route, photos=8)
+        settings = replace(demo, lens=lens, route=route, thermal=None)  # small: the way is the same
         for _ in skyquilt.simulate.simulate(settings, work / "flight"):
             pass
         photos = work / "flight" / "photos"

@@ -1,5 +1,5 @@
-"""A survey of 200 photos, the last seven of which come later: what a photo costs beside a quarter of
-it, memory, and what photos cost that are added.
+"""A survey of 200 photos, the last seven of which come later: what a photo costs beside a quarter
+of it, memory, and what photos cost that are added.
 """
 
 import json
