@@ -1,5 +1,5 @@
-"""A survey of 200 photos, the last seven of which come later: what a photo costs beside a quarter
-of it, memory, and what photos cost that are added.
+"""A survey of 300 photos, the last ten of which come later: what a photo costs beside a quarter of
+it, memory, and what photos cost that are added.
 """
 
 import json
@@ -14,7 +14,7 @@ from skyquilt.alignment.control import fit_similarity_3d
 
 ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.slow
-PHOTOS, LATER = 200, 7
+PHOTOS, LATER = 300, 10
 
 
 @pytest.fixture(scope="module")
@@ -66,8 +66,8 @@ def test_a_photo_of_a_large_survey_costs_what_one_of_a_small_survey_does(flight,
     assert large["blocks"] == [PHOTOS - LATER]
     assert large["reprojection_error_px"]["rms"] < 0.2
     each = large["cpu_seconds"] / (PHOTOS - LATER)
-    assert each < 1.1 * small["cpu_seconds"] / (PHOTOS // 4)
-    assert large["peak_memory_mb"] < 850
+    assert each < 1.3 * small["cpu_seconds"] / (PHOTOS // 4)
+    assert large["peak_memory_mb"] < 1000
     before, error = centres(out), off_truth(flight, out)
 
     whole = mapped(some(flight, survey, PHOTOS), out, "--add")
