@@ -183,7 +183,7 @@ def test_another_constant_is_another_key(artefact, constant, monkeypatch):
         (np.arange(4.0), lambda v: v.__setitem__(2, 9.0), lambda v: v.__setitem__(2, 2.0)),
         (({"a": 1}, 2), lambda v: v[0].update(a=3), lambda v: v[0].update(a=1)),
     ],
-    ids=str,
+    ids=["number", "nested", "dict", "list", "set", "array", "tuple"],
 )
 def test_a_constant_that_is_changed_in_place_is_another_key(monkeypatch, constant, change, back):
     """Keys are remembered while all constants are what they were, not the same objects only."""

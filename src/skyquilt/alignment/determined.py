@@ -65,14 +65,15 @@ def _left_out(
     whole = _Growth(alignment, block, priors)
     groups, rest = list[set[int]](), set(block)
     while rest:
-        groups.append(rest - whole.grown(rest).keys())
-        rest -= groups[-1]
+        left = whole.grown(rest)
+        groups.append(rest - left)
+        rest = left
         if not rest and len(groups) == 1:
             return {}
         if len(rest) < FEWEST_PLACED and len(rest) <= max(map(len, groups)):
             break
     largest = max(groups, key=len)
-    reasons = whole.grown(set(block), largest)
+    reasons = whole.reasons(whole.grown(set(block), largest))
     held = set(block) - reasons.keys()
     for group in groups:
         if group is not largest and _placed(alignment, group & reasons.keys(), held, priors):
@@ -119,15 +120,15 @@ class _Growth:
         self.first = np.searchsorted(ties.point, np.arange(len(ties.xyz) + 1))
         self.last = max(block)
 
-    def grown(self, photos: set[int], among: set[int] | None = None) -> dict[int, str]:
-        """Those of these photos that never join a group, with reasons; it starts with the photo
-        that has most tie points, of those `among` which it shall.
+    def grown(self, photos: set[int], among: set[int] | None = None) -> set[int]:
+        """Those of these photos that never join a group; it starts with the photo that has most tie
+        points, of those `among` which it shall.
         """
         ties = self.alignment.ties
         self.shown = np.zeros(len(ties.xyz), np.bool_)
         self.number = np.zeros(max(self.last, int(ties.photo.max(initial=0))) + 1, np.int64)
         start = max(sorted(among or photos), key=lambda i: len(self.own[i]))
-        left, reasons = photos - {start}, dict[int, str]()
+        left, self.tried = photos - {start}, dict[int, str]()
         self._join(start)
         tried = np.zeros(len(self.number), np.int64)
         among_left = np.zeros(len(self.number), np.bool_)
@@ -140,13 +141,16 @@ class _Growth:
             tried[photo] = self.number[photo]
             why = self._why_weak(photo)
             if why:
-                reasons[photo] = why
+                self.tried[photo] = why
                 continue
-            reasons.pop(photo, None)
             left.remove(photo)
             among_left[photo] = False
             self._join(photo)
-        return {i: reasons.get(i) or self._why_weak(i) for i in sorted(left)}
+        return left
+
+    def reasons(self, left: set[int]) -> dict[int, str]:
+        """Why photos never joined the group that grew last."""
+        return {i: self.tried.get(i) or self._why_weak(i) for i in sorted(left)}
 
     def _join(self, photo: int) -> None:
         points = self.alignment.ties.point[self.own[photo]]
