@@ -45,7 +45,15 @@ _OTHER_PICTURES = frozenset(
 """Endings of pictures in formats that are not read."""
 RUN_MARKS = frozenset({"run.toml", "live.db", ".skyquilt"})
 """What the folder of an earlier run or of a live map holds, each one or another of these."""
-_DAMAGED = "truncated", "broken", "damaged", "empty", "cannot be read", "cannot be decoded"
+_DAMAGED = (
+    "truncated",
+    "cut off",
+    "broken",
+    "damaged",
+    "empty",
+    "cannot be read",
+    "cannot be decoded",
+)
 """Words in the reasons of files that another copy may not have."""
 _SIDE_NAMES = frozenset({"geo.txt", "gcp_list.txt"})
 
