@@ -4,6 +4,7 @@ import io
 import json
 import os
 import shutil
+import time
 from pathlib import Path
 
 import numpy as np
@@ -264,7 +265,10 @@ def test_two_spectra_lie_beside_each_other_on_either_side_of_the_handle(page, bo
                 not (site.live.queues.untried or site.live.redraw.dirty or site.live.redraw.later)
             )
         )
-        site.settle()  # later adjustments move photos: the pictures compared show one state
+        before = None
+        while (now := site.web.get("/photos").json()["photos"]) != before:
+            before = now  # later adjustments move photos: the pictures compared show one state
+            time.sleep(5)
         page.goto(site.url)
         page.wait_for_selector("#link.live")
         holds(page, "[...document.querySelector('#layer').options].some(o => o.value == 'thermal')")

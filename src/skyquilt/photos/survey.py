@@ -31,6 +31,7 @@ from skyquilt.photos.read import ReadPhoto, read_photo
 from skyquilt.photos.recoded import UNNAMED, recoded
 from skyquilt.photos.side_files import apply_positions
 from skyquilt.photos.side_rows import sentence_of
+from skyquilt.photos.thermal import UNREAD
 from skyquilt.photos.thermal_units import in_one_unit, unit_notes
 from skyquilt.settings import InputSettings
 from skyquilt.video.read import CLIP_ENDINGS, side_files
@@ -186,9 +187,10 @@ def read_survey(
         read(path, name=name, thermal_unit=thermal_unit, most_mp=max_mp)
         for name, path in found.photos
     ]
-    files = in_one_unit(
-        files, lambda p, unit: read(p.path, name=p.name, thermal_unit=unit, most_mp=max_mp)
-    )
+    if any(isinstance(p, Photo) and p.stored for p in files):
+        files = in_one_unit(
+            files, lambda p, unit: read(p.path, name=p.name, thermal_unit=unit, most_mp=max_mp)
+        )
     rejected = [p for p in files if isinstance(p, RejectedPhoto)]
     films, more_rejected = read_clips(found.clips, geo) if clips else ((), ())
     rejected += more_rejected
@@ -338,7 +340,7 @@ def survey_notes(photos: Sequence[Photo], copies: int = 0) -> tuple[str, ...]:
     return (
         *_cameras(photos),
         *band_note(photos),
-        *unit_notes(photos),
+        *(unit_notes(photos) if any(map(_may_be_thermal, photos)) else ()),
         *_gaps(photos),
         *_clocks(photos),
         *_copies(copies),
@@ -363,6 +365,10 @@ def _cameras(photos: Sequence[Photo]) -> Iterator[str]:
             f"{deep} photos in colour have floating-point values: these are mapped as recorded,"
             " without a balance of brightness; for one, save them with 8 or 16 bits."
         )
+
+
+def _may_be_thermal(photo: Photo) -> bool:
+    return photo.band == "thermal" or photo.dtype != "uint8" or UNREAD in photo.notes
 
 
 def _gaps(photos: Sequence[Photo]) -> Iterator[str]:

@@ -85,6 +85,8 @@ class FeaturedPhotos:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Sentences on photos that do not belong in one map."""
+        if all(p.band != "thermal" for p in self.photos):
+            return ()
         return palette_notes(self.photos, self.thumbnails(range(len(self.photos))))
 
     def detail(self, photo: int) -> NDArray[np.float32]:
