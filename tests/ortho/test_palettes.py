@@ -2,15 +2,15 @@
 not.
 """
 
-from pathlib import Path
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from skyquilt.model.photo import Focal, Photo
 from skyquilt.ortho.palettes import palette_notes
+from tests.alignment import surveys
 
 MAPS = {
     "iron": cv2.COLORMAP_INFERNO,
@@ -21,22 +21,7 @@ MAPS = {
 
 
 def photo(band="thermal", unit=""):
-    return Photo(
-        name="a.jpg",
-        path=Path("a.jpg"),
-        digest="0",
-        width=640,
-        height=512,
-        channels=3,
-        dtype="uint8",
-        band=band,
-        unit=unit,
-        camera_key="c",
-        focal=Focal(px=500.0, sigma_px=50.0, source="guess"),
-        position=None,
-        attitude=None,
-        time=None,
-    )
+    return replace(surveys.photo(position=None), band=band, unit=unit)
 
 
 def frames(palettes, seed=1, *, own_range=True):

@@ -49,7 +49,8 @@ def weak_photos(alignment: Alignment, priors: Sequence[Prior]) -> dict[int, str]
 
     Each block grows photo by photo from the one with most tie points: a photo joins by the points
     that photos of the block show already. So photos that are linked with each other, but as a group
-    with few others, do not support each other: the largest group is the block.
+    with few others, do not support each other: the largest group is the block, with those groups
+    that the positions of their own photos place.
     """
     found: dict[int, str] = {}
     for block in alignment.blocks:
@@ -86,28 +87,20 @@ def _placed(alignment: Alignment, group: set[int], held: set[int], priors: Seque
     with nothing, and agree with where it lies beside those that are `held`: a flight line that
     overlaps the next one by little. False where tie points moved it elsewhere.
     """
-    own, others = _off_positions(alignment, group, priors), _off_positions(alignment, held, priors)
+    own, others = (
+        [i for i in sorted(some) if np.isfinite(priors[i].map_C[:2]).all()]
+        for some in (group, held)
+    )
     if len(own) < FEWEST_PLACED or len(others) < FEWEST_PLACED:
         return False
-    told = np.array([priors[i].map_C[:2] for i in _located(group, priors)])
-    stated = float(np.median([priors[i].sigma_C[0] for i in _located(group | held, priors)]))
-    middle = np.median(others, axis=0)
-    usual = max(stated, float(np.median(np.linalg.norm(others - middle, axis=1))))
-    if float(np.ptp(told, axis=0).max()) < EXTENDED * usual:
-        return False
-    return float(np.median(np.linalg.norm(own - middle, axis=1))) < AGREEING * usual
-
-
-def _located(photos: set[int], priors: Sequence[Prior]) -> list[int]:
-    """Those of the photos that report a position, in order."""
-    return [i for i in sorted(photos) if np.isfinite(priors[i].map_C[:2]).all()]
-
-
-def _off_positions(alignment: Alignment, photos: set[int], priors: Sequence[Prior]) -> Array:
-    """(n, 2) how far photos that report a position lie from it in m."""
-    return np.array(
-        [alignment.poses[i].map_C[:2] - priors[i].map_C[:2] for i in _located(photos, priors)]
-    ).reshape(-1, 2)
+    told = np.array([priors[i].map_C[:2] for i in own + others])
+    off = np.array([alignment.poses[i].map_C[:2] for i in own + others]) - told
+    off -= np.median(off[len(own) :], axis=0)
+    away = np.linalg.norm(off, axis=1)
+    stated = float(np.median([priors[i].sigma_C[0] for i in own + others]))
+    usual = max(stated, float(np.median(away[len(own) :])))
+    extent = float(np.ptp(told[: len(own)], axis=0).max())
+    return extent >= EXTENDED * usual and float(np.median(away[: len(own)])) < AGREEING * usual
 
 
 class _Growth:
@@ -128,7 +121,7 @@ class _Growth:
         self.shown = np.zeros(len(ties.xyz), np.bool_)
         self.number = np.zeros(max(self.last, int(ties.photo.max(initial=0))) + 1, np.int64)
         start = max(sorted(among or photos), key=lambda i: len(self.own[i]))
-        left, self.tried = photos - {start}, dict[int, str]()
+        left, self.weak = photos - {start}, dict[int, str]()
         self._join(start)
         tried = np.zeros(len(self.number), np.int64)
         among_left = np.zeros(len(self.number), np.bool_)
@@ -141,7 +134,7 @@ class _Growth:
             tried[photo] = self.number[photo]
             why = self._why_weak(photo)
             if why:
-                self.tried[photo] = why
+                self.weak[photo] = why
                 continue
             left.remove(photo)
             among_left[photo] = False
@@ -150,7 +143,7 @@ class _Growth:
 
     def reasons(self, left: set[int]) -> dict[int, str]:
         """Why photos never joined the group that grew last."""
-        return {i: self.tried.get(i) or self._why_weak(i) for i in sorted(left)}
+        return {i: self.weak.get(i) or self._why_weak(i) for i in sorted(left)}
 
     def _join(self, photo: int) -> None:
         points = self.alignment.ties.point[self.own[photo]]

@@ -96,10 +96,12 @@ def misfit_px(found: Alignment) -> float:
     return float(np.linalg.norm(found.ties.residual_px, axis=1).mean())
 
 
-def fits_better(other: Alignment, found: Alignment) -> bool:
-    """Whether an alignment fits the pictures clearly better than another, with no fewer photos."""
+def fits_better(other: Alignment, found: Alignment, *, kept: float = 1.0) -> bool:
+    """Whether an alignment fits the pictures clearly better than another, with no fewer photos and
+    at least this share of the observations.
+    """
     whole = len(other.held) >= len(found.held)
-    whole &= len(other.ties.photo) >= len(found.ties.photo)
+    whole &= len(other.ties.photo) >= kept * len(found.ties.photo)
     return whole and misfit_px(other) < BETTER * misfit_px(found)
 
 

@@ -164,12 +164,7 @@ def _enlargements(last: Tried, survey: Survey) -> Tried:
 def _cut_pictures(last: Tried, survey: Survey) -> Tried:
     """Principal points of photos that were cut off are told by these alone."""
     cameras = survey.cut(last)
-    if not cameras:
-        return last
-    other = survey.tried(last.begun, cut=cameras, name="cut ")
-    if not fits_cut(other.found, last.found):
-        return last
-    return replace(other, notes=(*last.notes, *cut_notes(other.found, cameras)))
+    return _freed(last, survey, cameras, fits_cut, cut_notes, cut=cameras, name="cut ")
 
 
 def _late_positions(last: Tried, survey: Survey) -> Tried:
@@ -229,12 +224,7 @@ def _found_directions(last: Tried, survey: Survey) -> Tried:
 def _unfit_cameras(last: Tried, survey: Survey) -> Tried:
     """Shutters and aspect ratios that pictures contradict are told by these alone."""
     cameras = survey.unfit(last)
-    if not cameras:
-        return last
-    other = survey.tried(last.begun, loose=cameras, name="unfit ")
-    if not fits_as_well(other.found, last.found):
-        return last
-    return replace(other, notes=(*last.notes, *unfit_notes(other.found, cameras)))
+    return _freed(last, survey, cameras, fits_as_well, unfit_notes, loose=cameras, name="unfit ")
 
 
 def _displaced_parts(last: Tried, survey: Survey) -> Tried:
@@ -246,6 +236,23 @@ def _displaced_parts(last: Tried, survey: Survey) -> Tried:
     if together is None:
         return last
     return _if_nearer(last, survey, together.priors, "together ", together.note)
+
+
+def _freed(
+    last: Tried,
+    survey: Survey,
+    cameras: frozenset[str],
+    fits: Callable[[Alignment, Alignment], bool],
+    notes: Callable[[Alignment, frozenset[str]], tuple[str, ...]],
+    **changes: Any,
+) -> Tried:
+    """The adjustment with changes that free some cameras, where there are any and it `fits`."""
+    if not cameras:
+        return last
+    other = survey.tried(last.begun, **changes)
+    if not fits(other.found, last.found):
+        return last
+    return replace(other, notes=(*last.notes, *notes(other.found, cameras)))
 
 
 def _if_nearer(last: Tried, survey: Survey, priors: Sequence[Prior], name: str, note: str) -> Tried:

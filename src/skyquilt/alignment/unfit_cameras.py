@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.enlarged import BETTER, misfit_px
+from skyquilt.alignment.enlarged import fits_better, misfit_px
 from skyquilt.alignment.outcome import ASPECT, NO_FIT
 from skyquilt.alignment.problem import READOUT
 from skyquilt.alignment.setup import SIGMA_ASPECT, Setup
@@ -94,12 +94,14 @@ def uncentred(setup: Setup, cameras: Collection[str]) -> Setup:
     """The same for an adjustment in which pictures alone tell the principal points that are assumed
     of some cameras.
     """
+    if not cameras:
+        return setup
     sigma: Floats = setup.base.sigma_K.copy()
     for row in (k for k, key in enumerate(setup.camera_keys) if key in cameras):
         longer = float(setup.size[setup.members[setup.camera == row]].max())
         if _middle_assumed(sigma[row], setup.base.free[row], longer):
             sigma[row, [CX, CY]] = LOOSE_MIDDLE * longer
-    return replace(setup, base=replace(setup.base, sigma_K=sigma)) if cameras else setup
+    return replace(setup, base=replace(setup.base, sigma_K=sigma))
 
 
 def loosened(setup: Setup, cameras: Collection[str]) -> Setup:
@@ -141,12 +143,8 @@ def unfit_notes(found: Alignment, cameras: Collection[str]) -> tuple[str, ...]:
 
 
 def fits_cut(other: Alignment, found: Alignment) -> bool:
-    """Whether an alignment with principal points that pictures tell is the better one: it holds as
-    many photos and nearly as many observations, and fits these clearly better.
-    """
-    as_many = len(other.held) >= len(found.held)
-    as_many &= len(other.ties.photo) >= KEPT * len(found.ties.photo)
-    return as_many and misfit_px(other) < BETTER * misfit_px(found)
+    """Whether an alignment with principal points that pictures tell fits these clearly better."""
+    return fits_better(other, found, kept=KEPT)
 
 
 def cut_notes(found: Alignment, cameras: Collection[str]) -> tuple[str, ...]:

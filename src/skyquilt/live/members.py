@@ -231,7 +231,7 @@ class Members:
             self.block_of[member.id] = member.id
             self.blocks[member.id] = {member.id}
             new.append(member)
-        if self.frame is not None:
+        if new and self.frame is not None:
             self._doubt_positions(new)
         return new
 

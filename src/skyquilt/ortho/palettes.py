@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.model.photo import Photo
+from skyquilt.model.photo import Photo, evenly
 
 _MOST = 60
 """Photos that are compared, spread evenly over the flight; each with each other."""
@@ -32,7 +32,7 @@ def palette_notes(
     shown = [k for k in sorted(thumbnails) if _is_palette(photos[k])]
     if len(shown) < 2:
         return ()
-    some = [shown[k] for k in np.unique(np.linspace(0, len(shown) - 1, _MOST).astype(int))]
+    some = [shown[k] for k in evenly(len(shown), _MOST)]
     groups = _alike([_colours(thumbnails[k]) for k in some])
     if len(groups) < 2:
         return ()
