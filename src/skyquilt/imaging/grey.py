@@ -119,25 +119,27 @@ def detail(pixels: NDArray[Any]) -> NDArray[np.float32]:
     out = np.full((rows, columns, 3), np.nan, np.float32)
     if pixels.dtype != np.uint8 or side < 32:
         return out
-    for i in range(rows):
-        for j in range(columns):
-            y, x = (2 * i + 1) * height // (2 * rows), (2 * j + 1) * width // (2 * columns)
-            y, x = y - side // 2, x - side // 2
-            patch = to_grey8(pixels[y : y + side, x : x + side])
-            half = cv2.resize(patch, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-            eighth = cv2.resize(half, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
-            fine = _second(half) + PLAIN
-            out[i, j, :2] = np.log(fine / (_second(eighth) + PLAIN))
-            out[i, j, 2] = np.log(fine.mean() / (float(half.mean()) ** 2 + 1))
+    top = (2 * np.arange(rows) + 1) * height // (2 * rows) - side // 2
+    left = (2 * np.arange(columns) + 1) * width // (2 * columns) - side // 2
+    cells = [pixels[y : y + side, x : x + side] for y in top for x in left]
+    grey = to_grey8(np.concatenate(cells))  # one below the other, so that all are reduced at once
+    half = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    eighth = cv2.resize(half, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+    halves = half.reshape(-1, side // 2, side // 2).astype(np.float32)
+    fine = _second(halves) + PLAIN
+    coarse = _second(eighth.reshape(-1, side // 8, side // 8).astype(np.float32)) + PLAIN
+    out[..., :2] = np.log(fine / coarse).reshape(rows, columns, 2)
+    brightness = halves.mean((1, 2), dtype=np.float64)
+    out[..., 2] = np.log(fine.mean(1) / (brightness**2 + 1)).reshape(rows, columns)
     return out
 
 
-def _second(grey: NDArray[Any]) -> NDArray[np.float64]:
-    """Mean squares (2,) of second differences along x and y."""
-    plain = grey.astype(np.float32)
-    along = plain[:, 2:] - 2 * plain[:, 1:-1] + plain[:, :-2]
-    across = plain[2:] - 2 * plain[1:-1] + plain[:-2]
-    return np.array([float(np.mean(along**2)), float(np.mean(across**2))])
+def _second(grey: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Mean squares (N, 2) of second differences along x and y of images (N, h, w)."""
+    along = grey[:, :, 2:] - 2 * grey[:, :, 1:-1] + grey[:, :, :-2]
+    across = grey[:, 2:] - 2 * grey[:, 1:-1] + grey[:, :-2]
+    squares = [np.einsum("nij,nij->n", d, d) / (d.shape[1] * d.shape[2]) for d in (along, across)]
+    return np.stack(squares, axis=1).astype(np.float64)
 
 
 def full_px(px: NDArray[Any], shape: tuple[int, int], full: tuple[int, int]) -> NDArray[np.float64]:
