@@ -116,9 +116,11 @@ def reduced(
     share = np.asarray(averaged(opaque, size), np.uint8)
     solid = np.nan_to_num(pixels) if pixels.dtype.kind == "f" else pixels
     mean = averaged(solid, size).reshape(*share.shape, -1)
-    if share.min() < 255:  # invalid pixels are zero: divide by the valid share
-        whole = mean.astype(np.float32) * (255.0 / np.maximum(share, 1))[..., None]
-        mean = (np.minimum(whole, 255) if pixels.dtype == np.uint8 else whole).astype(pixels.dtype)
+    partly = (share > 0) & (share < 255)  # invalid pixels are zero: divide by the valid share
+    if partly.any():
+        whole = mean[partly].astype(np.float32) * (255.0 / share[partly])[:, None]
+        mean = mean.copy()  # at a factor of 1 it shares its memory with the pixels
+        mean[partly] = np.minimum(whole, 255) if pixels.dtype == np.uint8 else whole
     return mean, share
 
 
