@@ -14,6 +14,7 @@ from skyquilt.alignment.enlarged import as_enlarged
 from skyquilt.alignment.equations import NearFactor
 from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
 from skyquilt.alignment.motion import speeds_of
+from skyquilt.alignment.near_positions import told_besides
 from skyquilt.alignment.oblique import found_oblique, hung, tilts_reported
 from skyquilt.alignment.oblique_guess import LOWERED, guessed_priors, lowered
 from skyquilt.alignment.oblique_start import reported_start, slanting
@@ -142,6 +143,7 @@ class Bundle:
             weak = weak_photos(found, begun.priors)
         own = enlarged(begun)
         done = hung(found, weak, own, begun.priors, features, links, begun.aside)
+        done = told_besides(done, priors, ground_of(frame))
         return replace(done, notes=(*done.notes, *notes)) if notes else done
 
     def _in_space(self, begun: Beginning) -> bool:

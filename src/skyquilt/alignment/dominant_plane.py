@@ -2,8 +2,6 @@
 positions nor angles.
 """
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -51,15 +49,7 @@ def levelled(alignment: Alignment) -> Alignment:
     Q = turning(np.array([normal, side, np.cross(normal, side)]), _frame(up, side))
     if np.linalg.norm(side) < 1e-9:
         return alignment
-    middle = np.median(xyz, axis=0)
-    return replace(
-        alignment,
-        poses={
-            i: replace(p, cam_R_map=p.cam_R_map @ Q.T, map_C=(p.map_C - middle) @ Q.T + middle)
-            for i, p in alignment.poses.items()
-        },
-        ties=replace(alignment.ties, xyz=(xyz - middle) @ Q.T + middle),
-    )
+    return alignment.carried(Q, 1.0, np.median(xyz, axis=0))
 
 
 def _frame(up: Array, side: Array) -> Array:

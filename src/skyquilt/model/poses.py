@@ -1,7 +1,7 @@
 """Where photos are: the map frame, poses, and the result of an alignment."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -252,6 +252,28 @@ class Alignment:
     def camera(self, photo: int) -> Camera:
         """The calibration of a photo."""
         return self.cameras[self.camera_of[photo]]
+
+    def carried(self, turn: Array, factor: float, middle: Array) -> "Alignment":
+        """The alignment of photos placed in space without control points, turned by `turn` (3, 3)
+        and enlarged by a factor about a point (3,): photos show what they did.
+        """
+
+        def there(places: Array) -> Array:
+            return np.asarray(middle + factor * (places - middle) @ turn.T)
+
+        def pose(p: Pose) -> Pose:
+            motion = p.motion
+            if motion is not None:
+                motion = replace(motion, shift_m=factor * turn @ motion.shift_m)
+            return replace(p, cam_R_map=p.cam_R_map @ turn.T, map_C=there(p.map_C), motion=motion)
+
+        told = self.accuracy
+        return replace(
+            self,
+            poses={i: pose(p) for i, p in self.poses.items()},
+            ties=replace(self.ties, xyz=there(self.ties.xyz)),
+            accuracy=None if told is None else replace(told, xyz=there(told.xyz)),
+        )
 
 
 def no_ties() -> TiePoints:

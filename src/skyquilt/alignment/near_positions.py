@@ -1,0 +1,140 @@
+"""Photos taken so near to each other, for the errors of their positions, that these hardly tell how
+large the map is and where its north lies: a hover, a panorama, a handful of photos. Heights above
+take-off and reported headings tell it besides.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.geometry.frames import angles_from_cam_R_map
+from skyquilt.model.poses import Alignment, Prior
+
+LOOSE_SCALE, LOOSE_DEG = 0.05, 5.0
+"""Deviations of the map's scale, as a share, and of its direction; where positions leave them
+larger, heights and headings count besides.
+"""
+EVEN = 0.05
+"""Deviation of the height of the place of take-off against level ground, and of the height above it
+that is reported, as a share of that height.
+"""
+CONTRADICTED = 3.5
+"""Heights and headings that contradict the positions by more deviations are not used: the place of
+take-off lies elsewhere, or files were turned.
+"""
+ALIKE_DEG = 30.0
+"""Reported headings are off by one angle if most are off by about as much."""
+
+
+def told_besides(found: Alignment, priors: Sequence[Prior], ground_m: float) -> Alignment:
+    """An alignment without control points, enlarged and turned about the middle of its photos by
+    what heights above take-off (`ground_m`: its height in the frame; NaN = not known) and headings
+    tell of it, where positions hardly do. Each counts by its deviation. The shape, and what the
+    pictures show, stay.
+    """
+    held = [i for i in found.held if np.isfinite(priors[i].map_C).all()]
+    if found.control or found.frame.crs is None or not held:
+        return found
+    scale, heading = _scale(found, priors, held, ground_m), _heading(found, priors, held)
+    says = [told.note for told in (scale, heading) if told]
+    if not says:
+        return found
+    if scale and found.accuracy is not None:
+        accuracy = replace(found.accuracy, sigma_m=scale.narrowed * found.accuracy.sigma_m)
+        found = replace(found, accuracy=accuracy)
+    a = heading.change if heading else 0.0
+    turn = np.array([[np.cos(a), np.sin(a), 0], [-np.sin(a), np.cos(a), 0], [0, 0, 1]])
+    middle = np.mean([found.poses[i].map_C for i in held], axis=0)
+    found = found.carried(turn, 1 + scale.change if scale else 1.0, middle)
+    return replace(found, notes=(*found.notes, *says))
+
+
+@dataclass(frozen=True)
+class _Told:
+    """What metadata tell of a map besides its positions."""
+
+    note: str
+    """What the user should know."""
+    change: float = 0.0
+    """Of the scale, as a share; of the direction, rad clockwise."""
+    narrowed: float = 1.0
+    """Deviations after the change over those before."""
+
+
+def _loose(found: Alignment, priors: Sequence[Prior], held: Sequence[int], axes: int) -> float:
+    """Deviation of what the positions tell by their first axes: with three of the scale, as a
+    share, with two of the direction, in rad.
+    """
+    C = np.array([found.poses[i].map_C for i in held])
+    sigma = np.array([priors[i].sigma_C for i in held])
+    reach = C - np.average(C, axis=0, weights=sigma[:, 0] ** -2)
+    tells = float(((reach / sigma)[:, :axes] ** 2).sum())
+    return 1 / float(np.sqrt(max(tells, 1e-6)))
+
+
+def _weighed(apart: float, loose: float, told: float) -> tuple[float, float] | None:
+    """The change of what has a deviation `loose` towards what lies `apart` and has the deviation
+    `told`, and the share of the deviation that is left; None where they contradict each other.
+    """
+    if abs(apart) > CONTRADICTED * np.hypot(loose, told):
+        return None
+    share = loose**2 / (loose**2 + told**2)
+    return share * apart, float(np.sqrt(1 - share))
+
+
+def _scale(
+    found: Alignment, priors: Sequence[Prior], held: Sequence[int], ground_m: float
+) -> _Told | None:
+    xyz, loose = found.ties.xyz, _loose(found, priors, held, 3)
+    above = float(np.median([priors[i].map_C[2] for i in held])) - ground_m
+    if not len(xyz) or not above > 1 or not loose > LOOSE_SCALE:
+        return None
+    low, ground, top = np.quantile(xyz[:, 2], [0.16, 0.5, 0.84])
+    high = float(np.median([found.poses[i].map_C[2] for i in held]) - ground)
+    if not high > 0:
+        return None
+    uneven = float(np.hypot(EVEN, (top - low) / (2 * high)))
+    weighed = _weighed(above / high - 1, loose, uneven * above / high)
+    if weighed is None:
+        return _Told(
+            f"Positions near to each other tell that the photos were taken {high:.0f} m above the"
+            f" ground, but they report {above:.0f} m above take-off: the place of take-off lies"
+            " higher or lower, or the map is too large or small. Control points would tell."
+        )
+    return _Told(
+        f"The photos were taken so near to each other that their positions tell the map's scale to"
+        f" {min(100 * loose, 100):.0f} % only. So it rests on heights above take-off, too, which"
+        " tell it where the ground is as high as the place of take-off. Control points would"
+        " settle it.",
+        *weighed,
+    )
+
+
+def _heading(found: Alignment, priors: Sequence[Prior], held: Sequence[int]) -> _Told | None:
+    told = [i for i in held if np.isfinite(priors[i].yaw_deg)]
+    loose = float(np.degrees(_loose(found, priors, held, 2)))
+    if not loose > LOOSE_DEG or 2 * len(told) < len(held) or not told:
+        return None
+    grid = [angles_from_cam_R_map(found.poses[i].cam_R_map)[0] for i in told]
+    off = np.array([priors[i].yaw_deg for i in told]) - grid
+    apart = np.abs(_wrapped(off[:, None] - off))
+    usual = off[np.argmin(apart.sum(1))]  # files that were turned have another one
+    alike = _wrapped(off - usual)
+    if 2 * (np.abs(alike) < ALIKE_DEG).sum() <= len(alike):
+        return None
+    by = float(_wrapped(usual + np.median(alike[np.abs(alike) < ALIKE_DEG])))
+    weighed = _weighed(by, loose, float(np.median([priors[i].sigma_yaw_deg for i in told])))
+    if weighed is None:
+        return None  # told for each photo (`alignment.conflicts`)
+    return _Told(
+        f"The photos were taken so near to each other that their positions tell the map's"
+        f" direction to {min(loose, 180):.0f} degrees only. So it rests on their headings, too.",
+        float(np.radians(weighed[0])),
+    )
+
+
+def _wrapped(degrees: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Angles between -180 and 180 degrees."""
+    return np.asarray((degrees + 180) % 360 - 180)
