@@ -20,6 +20,10 @@ EVEN = 0.05
 """Deviation of the height of the place of take-off against level ground, and of the height above it
 that is reported, as a share of that height.
 """
+MOST_LOOSER = 3.0
+"""The ground's scale is taken for so many times less certain than the positions' at most: those of
+RTK are not given up for heights above take-off.
+"""
 CONTRADICTED = 3.5
 """Heights and headings that contradict the positions by more deviations are not used: the place of
 take-off lies elsewhere, or files were turned.
@@ -74,6 +78,19 @@ def _loose(found: Alignment, priors: Sequence[Prior], held: Sequence[int], axes:
     return 1 / float(np.sqrt(max(tells, 1e-6)))
 
 
+def _loose_ground(found: Alignment, held: Sequence[int]) -> float:
+    """Deviation of the scale of the ground, as a share, as that of its points tells: lines of
+    sight that meet at small angles leave it less certain than the positions.
+    """
+    if found.accuracy is None:
+        return 0.0
+    middle = np.mean([found.poses[i].map_C[:2] for i in held], axis=0)
+    far = np.linalg.norm(found.accuracy.xyz[:, :2] - middle, axis=1)
+    outer = far >= np.median(far)
+    off = np.linalg.norm(found.accuracy.sigma_m[:, :2], axis=1) / np.sqrt(2)
+    return float(np.median(off[outer] / np.maximum(far[outer], 1e-6)))
+
+
 def _weighed(apart: float, loose: float, told: float) -> tuple[float, float] | None:
     """The change of what has a deviation `loose` towards what lies `apart` and has the deviation
     `told`, and the share of the deviation that is left; None where they contradict each other.
@@ -87,7 +104,8 @@ def _weighed(apart: float, loose: float, told: float) -> tuple[float, float] | N
 def _scale(
     found: Alignment, priors: Sequence[Prior], held: Sequence[int], ground_m: float
 ) -> _Told | None:
-    xyz, loose = found.ties.xyz, _loose(found, priors, held, 3)
+    xyz, told = found.ties.xyz, _loose(found, priors, held, 3)
+    loose = max(told, min(_loose_ground(found, held), MOST_LOOSER * told))
     above = float(np.median([priors[i].map_C[2] for i in held])) - ground_m
     if not len(xyz) or not above > 1 or not loose > LOOSE_SCALE:
         return None
