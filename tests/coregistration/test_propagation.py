@@ -108,6 +108,26 @@ def test_wrong_pairs_are_outvoted_and_counted():
     assert found.evidence["pairs"] == 9 and 210 <= len(found.px_a) < 225
 
 
+def test_pairs_that_contradict_each_other_are_refused():
+    """Each pair has a similarity of its own; hundreds of correspondences of one are no agreement."""
+    x = np.linspace(-200, 200, 18)
+    cell = np.stack(np.meshgrid(x, x), -1).reshape(-1, 2)
+    here = {k: np.eye(3) for k in range(4)}
+    ask = Propagate(model="similarity", least_pairs=3, least_share=0.5)
+    shift = np.array([12.0, -7.0])
+    for seed in range(20):
+        r, pairs = rng(seed), []
+        for k in range(4):
+            px = r.uniform(100, 900, 2) + cell
+            pairs.append(PairPoints(a=k, b=k, px_a=px, px_b=px + r.normal(0, 60, 2)))
+        found = ask(pairs, here, here)
+        assert not found and "of 4 registered pairs agree" in found.reason
+        right = [PairPoints(a=p.a, b=p.b, px_a=p.px_a, px_b=p.px_a + shift) for p in pairs[:3]]
+        found = ask([*right, pairs[3]], here, here)
+        assert found and found.evidence["pairs_agreeing"] == 3
+        assert np.abs(transfer(found.b_H_a, cell + 500) - cell - 500 - shift).max() < 1
+
+
 def test_refusals():
     a_H, b_H = block(1), block(2)
     pairs = pairs_of(a_H, b_H, 30)

@@ -94,9 +94,15 @@ class Propagate:
     """Error in px below which it is an inlier."""
     minimum: int = 9
     """Fewest inliers."""
+    least_pairs: int = 1
+    """Fewest pairs that agree, that is, half of whose correspondences are inliers."""
+    least_share: float = 0.0
+    """Least share of all pairs that agree. One pair has hundreds of correspondences, so inliers
+    alone do not tell whether pairs contradict each other.
+    """
     steps: int = 20
     """Steps of reweighting."""
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     def __call__(
         self,
@@ -115,17 +121,17 @@ class Propagate:
             if self.balanced
             else np.ones(len(points.px_a))
         )
-        matrix = self._fitted(points, balance)
-        error = (
-            None
-            if matrix is None
-            else np.linalg.norm(transfer(matrix, points.px_a) - points.px_b, axis=1)
-        )
-        if matrix is None or error is None or (error < self.inlier_px).sum() < self.minimum:
+        matrix, error = self._agreed(points, balance)
+        if matrix is None or (error < self.inlier_px).sum() < self.minimum:
             return RefusedRegistration(
                 reason="the correspondences of the pairs do not fit a common transform"
             )
         inside = error < self.inlier_px
+        agreeing, of = _agreeing(points.pair, inside)
+        if agreeing < max(self.least_pairs, self.least_share * of):
+            return RefusedRegistration(
+                reason=f"{agreeing} of {of} registered pairs agree on one transform"
+            )
         return Registration(
             model="similarity" if self.model == "translation" else self.model,
             b_H_a=matrix,
@@ -133,14 +139,40 @@ class Propagate:
             px_b=points.px_b[inside],
             evidence={
                 "correspondences": float(len(inside)),
-                "pairs": float(len(np.unique(points.pair))),
-                "pairs_agreeing": float(len(np.unique(points.pair[inside]))),
+                "pairs": float(of),
+                "pairs_agreeing": float(agreeing),
             },
         )
 
-    def _fitted(self, points: Carried, balance: NDArray[np.float64]) -> Matrix | None:
-        """Least squares with Cauchy weights; their scale decreases from the median error."""
-        matrix = fit(self.model, points.px_a, points.px_b, balance)
+    def _agreed(
+        self, points: Carried, balance: NDArray[np.float64]
+    ) -> tuple[Matrix | None, NDArray[np.float64]]:
+        """The transform with which most pairs agree, and the error (n,) of each correspondence. It
+        is fitted from that of all pairs, and where not all agree from that of each pair, since one
+        pair far off keeps the first from the others.
+        """
+        best: tuple[Matrix | None, NDArray[np.float64]] = None, np.full(len(points.px_a), np.inf)
+        most, known = -1, np.unique(points.pair)
+        for one in (None, *known):
+            of = slice(None) if one is None else points.pair == one
+            start = fit(self.model, points.px_a[of], points.px_b[of], balance[of])
+            matrix = self._fitted(points, balance, start)
+            if matrix is None:
+                continue
+            error = np.linalg.norm(transfer(matrix, points.px_a) - points.px_b, axis=1)
+            agreeing, _ = _agreeing(points.pair, error < self.inlier_px)
+            if agreeing > most:
+                best, most = (matrix, error), agreeing
+            if most == len(known):
+                break
+        return best
+
+    def _fitted(
+        self, points: Carried, balance: NDArray[np.float64], matrix: Matrix | None
+    ) -> Matrix | None:
+        """Least squares with Cauchy weights from a start; their scale decreases from the median
+        error.
+        """
         for k in range(self.steps):
             if matrix is None:
                 return None
@@ -148,3 +180,11 @@ class Propagate:
             scale = max(self.scale_px, float(np.median(error)) * 0.7**k)
             matrix = fit(self.model, points.px_a, points.px_b, balance / (1 + (error / scale) ** 2))
         return matrix
+
+
+def _agreeing(pair: NDArray[np.int64], inside: NDArray[np.bool_]) -> tuple[int, int]:
+    """Number of pairs half of whose correspondences are inliers, and of all pairs. `pair` (n,) and
+    `inside` (n,) are those of each correspondence.
+    """
+    all_, good = np.bincount(pair), np.bincount(pair, weights=inside)
+    return int(((all_ > 0) & (2 * good >= all_)).sum()), int((all_ > 0).sum())

@@ -43,6 +43,9 @@ larger.
 """
 _GRID = 6
 """Points per side of the grid that represents a pair's transform."""
+_LEAST_PAIRS = 3
+"""Fewest pairs that must be registered, and agree."""
+_PROPAGATE = Propagate(model="similarity", least_pairs=_LEAST_PAIRS, least_share=0.5)
 
 
 def by_pairs(visual: Scene, thermal: Scene) -> Registration | RefusedRegistration:
@@ -52,12 +55,12 @@ def by_pairs(visual: Scene, thermal: Scene) -> Registration | RefusedRegistratio
     asked = overlapping(visual, thermal)
     told = [r for a, b in asked if (r := _registered(visual, thermal, a, b)) is not None]
     found = [p for p, _ in told]
-    if len(found) < 3:
+    if len(found) < _LEAST_PAIRS:
         return RefusedRegistration(
             reason=f"{len(found)} of {len(asked)} overlapping pairs of photos could be registered"
         )
     there = {p.a: np.eye(3) for p in found}, {p.b: np.eye(3) for p in found}
-    outcome = Propagate(model="similarity")(found, *there)
+    outcome = _PROPAGATE(found, *there)
     if isinstance(outcome, RefusedRegistration):
         return outcome
     counts = {
