@@ -109,7 +109,7 @@ def test_wrong_pairs_are_outvoted_and_counted():
 
 
 def test_pairs_that_contradict_each_other_are_refused():
-    """Each pair has a similarity of its own; hundreds of correspondences of one are no agreement."""
+    """Each pair has a transform of its own; hundreds of correspondences of one do not agree."""
     x = np.linspace(-200, 200, 18)
     cell = np.stack(np.meshgrid(x, x), -1).reshape(-1, 2)
     here = {k: np.eye(3) for k in range(4)}

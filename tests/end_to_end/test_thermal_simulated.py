@@ -47,8 +47,14 @@ def output(tmp_path_factory):
 
 
 def joined(flights, output, route, settings=SETTINGS):
-    *_, last = iter_thermal(flights / "photos", flights / "thermal", output, settings, route=route)
+    *events, last = iter_thermal(
+        flights / "photos", flights / "thermal", output, settings, route=route
+    )
     assert isinstance(last, Result)
+    warned = [
+        e.text for e in events if isinstance(e, Note) and e.warning and "which roof" in e.text
+    ]
+    assert len(warned) == (route == "positions")
     return last.metrics["thermal"]
 
 

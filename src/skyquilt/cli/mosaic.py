@@ -443,7 +443,7 @@ def with_thermal(result: "Result") -> str:
 
     t = result.metrics["thermal"]
     how = (
-        "its own positions alone"
+        "its own positions alone, several metres off without RTK"
         if t["route"] == "positions"
         else f"{t['route']}, {t['inliers']} {'pairs' if t['route'] == 'rig' else 'places'} agree"
     )

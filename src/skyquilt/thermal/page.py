@@ -80,7 +80,8 @@ _ROUTES = {
     " time of day.",
     "positions": "Both flights were mapped separately and are placed by their own positions:"
     " no registration could"
-    " be accepted.",
+    " be accepted. Without RTK the thermal map lies several metres beside the visual one, so it"
+    " does not tell which roof or plant is warm.",
 }
 _EVIDENCE = {
     "surprise": "agreement of independent patches, -log10 of its probability by chance",

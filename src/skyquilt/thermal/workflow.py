@@ -45,6 +45,11 @@ from skyquilt.workflows.survey_input import SurveyInput, read_input
 
 FOLDER = "thermal"
 """Folder of the thermal run, below the visual one's."""
+_BY_POSITIONS = (
+    "the thermal map is placed by the positions of both flights alone: without RTK it lies several"
+    " metres beside the visual map, so it does not tell which roof or plant is warm; check that"
+    " both flights show the same place, or fly both with RTK"
+)
 
 
 def iter_thermal(
@@ -196,6 +201,8 @@ def _joined(
         Note(text=f"registration by {name} was refused: {why}", warning=True)
         for name, why in joined.refused
     )
+    if joined.route == "positions":
+        yield Note(text=_BY_POSITIONS, warning=True)
     yield Result(output=output, metrics={**visual.result.metrics, **figures})
 
 
