@@ -19,6 +19,7 @@ from skyquilt.engine.background import Background
 from skyquilt.engine.clock import result_of
 from skyquilt.engine.store import Store
 from skyquilt.errors import AlignmentError, SkyquiltError
+from skyquilt.live.kept_frame import in_frame_of
 from skyquilt.live.ledger import Ledger
 from skyquilt.live.links import link_from
 from skyquilt.model.camera import Camera
@@ -140,6 +141,12 @@ def _whole(
 ) -> BlockAdjustment:
     pictures = GreyPictures(job.photos, lambda i: read_color(job.photos[i]), store)
     done = Bundle()(job.photos, job.frame, job.priors, features, links, (), pictures)
+    if job.frame.crs is None:
+        before = {k: job.poses[i] for k, i in enumerate(job.ids) if i in job.poses}
+        held = in_frame_of(done, before, job.ground)
+        if held is None:
+            raise AlignmentError("it does not fit the map, which has no place")
+        done = held
     xyz = _swept(done, pictures, job, store) if job.sweep else done.ties.xyz
     return BlockAdjustment(
         ids=job.ids,

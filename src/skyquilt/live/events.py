@@ -59,9 +59,13 @@ class MapEvents:
             "photo", {"id": member.id, "name": member.photo.name, "state": "superseded"}
         )
 
-    def place(self, member: Member) -> tuple[list[list[float]], list[float]]:
-        """Footprint and centre of a photo on the map, in degrees."""
+    def place(self, member: Member) -> tuple[list[list[float]], list[float] | None]:
+        """Footprint and centre of a photo on the map, in degrees; none where the map has no
+        place.
+        """
         assert member.pose is not None
+        if self.members.placeless:
+            return [], None
         outline = self.canvas.outline(member.id)
         ring = [] if outline is None else self.members.lonlat(outline)
         return ring, self.members.lonlat(member.pose.map_C[None, :2])[0]
@@ -77,9 +81,10 @@ class MapEvents:
             boxes = [self._degrees(a) for a in sorted(_gathered(changed))]
             low, high = np.min(boxes, axis=0).tolist(), np.max(boxes, axis=0).tolist()
             whole = [low[0], low[1], high[2], high[3]]
-            self.ledger.tell(
-                "tiles", {"layer": layer, "bounds": whole, "boxes": boxes, "count": len(changed)}
-            )
+            said = {"layer": layer, "bounds": whole, "boxes": boxes, "count": len(changed)}
+            if self.members.placeless:
+                said["placeless"] = True
+            self.ledger.tell("tiles", said)
 
     def _degrees(self, address: Address) -> list[float]:
         """West, south, east, north in degrees of all corners of a tile."""

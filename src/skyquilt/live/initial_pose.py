@@ -14,7 +14,7 @@ from skyquilt.live.adjustment_schedule import KEY as SCHEDULE
 from skyquilt.live.drone_metadata import Metadata
 from skyquilt.live.events import MapEvents, Update
 from skyquilt.live.ledger import hit
-from skyquilt.live.members import FAR_M, Member, Queues
+from skyquilt.live.members import FAR_M, Member, Queues, about_record
 from skyquilt.live.redraw_queue import RedrawQueue
 from skyquilt.ortho.ground import round_gsd
 from skyquilt.outside import whole
@@ -27,8 +27,8 @@ BEGAN, NO_PLACE = "begun at", "no place told"
 photo has a position.
 """
 NOWHERE = (
-    "no photo has a position so far, so nothing is shown: the map begins with the first that has"
-    " one, and the final map (--finish, or the button) needs none"
+    "no photo has a position so far: the map begins with the first that has one, or, without a"
+    " place, with four that overlap; the final map (--finish, or the button) needs none"
 )
 ABOVE_M = 50.0
 """Assumed flying height in m where the metadata do not contain one."""
@@ -52,9 +52,8 @@ class InitialPose:
 
     def place(self, member: Member) -> Update:
         """Places the photo, which is the first in the queue of received photos."""
-        warning, first = "", member
-        if self.members.frame is None and member.photo.position is not None:
-            first = self.members.by_id.get(self._begun_at(), member)
+        warning, first = "", self._first(member)
+        if self.members.frame is None and first.photo.position is not None:
             warning = self.metadata.frame_from(first)
         if self.members.frame is not None and self.canvas.gsd == 0:
             self._begin(first, warning)
@@ -102,35 +101,51 @@ class InitialPose:
         xyz = on_sphere(list(islice(known, 2 * FEW + 1)))
         return int((np.linalg.norm(xyz - xyz[0], axis=1) <= FAR_M).sum()) > begun
 
+    def _first(self, member: Member) -> Member:
+        """The photo with which the map begins: the one around which it is begun again, or this
+        one.
+        """
+        around = self.members.by_id.get(self._begun_at())
+        return member if around is None or around.state == "refused" else around
+
     def _begun_at(self) -> int:
         return whole(self.ledger.meta(BEGAN), 0) or 0
 
-    def begin_again(self, member: Member) -> Update:
+    def begin_again(self, member: Member | None, text: str = "") -> Update:
         """Takes everything off the map and puts all photos back into the queue, for a map around
-        this one. Until the change is stored, a restart begins with it again; what is in memory must
-        be read anew afterwards.
+        this one; without one, they wait with their links for a map without a place. Until the
+        change is stored, a restart begins with it again; what is in memory must be read anew
+        afterwards. `text` says why, if not because most photos lie in another place.
         """
-        far = self.members.distance_m(member.photo) / 1000
-        text = (
-            f"most photos lie {far:.0f} km from where the map began: it is begun again around them"
-        )
+        if not text and member is not None:
+            far = self.members.distance_m(member.photo) / 1000
+            text = (
+                f"most photos lie {far:.0f} km from where the map began: it is begun again around"
+                " them"
+            )
         self.redraw.clear()
         with self.ledger.change() as db:
-            for table in ("height", "camera", "link"):
+            for table in ("height", "camera", "link")[: None if member is not None else 2]:
                 db.execute(f"delete from {table}")
             for key in ("frame", "gsd", "cell", "ground", SCHEDULE):
                 db.execute("delete from meta where key = ?", (key,))
-            self.ledger.put_meta(BEGAN, member.id)
+            if member is not None:
+                self.ledger.put_meta(BEGAN, member.id)
             for m in self.members.by_id.values():
-                if m.state in ("placed", "refined", "waiting"):
-                    m.state = "received"
-                    self.map_events.photo(m, ring=[], at=None)
-                if m.state in ("received", "superseded"):
-                    m.pose, m.camera = None, ""
-                    self.members.save(m, footprint="", reason="", about={})
+                self._off(m, keep=member is None)
             self.ledger.tell("note", {"text": f"{text}."})
         hit("map begun again")
-        return Update(what="noted", photo=member.id, text=text)
+        return Update(what="noted", photo=member.id if member is not None else None, text=text)
+
+    def _off(self, member: Member, *, keep: bool) -> None:
+        """Takes a photo off the map (inside a transaction); with `keep` it stays compared."""
+        if member.state in ("placed", "refined", "waiting"):
+            member.state = "waiting" if keep else "received"
+            self.map_events.photo(member, ring=[], at=None)
+        if member.state in ("received", "superseded", "waiting"):
+            member.pose, member.camera, member.learned = None, "", None
+            about = about_record(member, "") if keep else {}
+            self.members.save(member, footprint="", reason="", about=about)
 
     def _preview(self, member: Member) -> Member | None:
         """The preview of the same shot that arrived before this photo; None if there is none."""
@@ -150,6 +165,14 @@ class InitialPose:
         gsd = asked / 100 if asked else round_gsd(3 * above / photo.focal.px)
         ground = 0.0 if takeoff else float(prior.map_C[2]) - above
         ground = ground if np.isfinite(ground) else 0.0
+        self.fix(gsd, above, ground, warning)
+
+    def fix(self, gsd: float, above: float, ground: float, warning: str) -> None:
+        """Fixes the map's frame and its pixel size in m (`gsd`), with photos taken `above` a ground
+        of this height in m; tells a warning, if any.
+        """
+        frame = self.members.frame
+        assert frame is not None
         cell = max(0.04 * above, 4 * gsd)
         self.canvas.gsd, self.canvas.ground, self.metadata.heights.cell = gsd, ground, cell
         with self.ledger.change():

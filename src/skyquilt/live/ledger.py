@@ -322,7 +322,9 @@ def _event(kind: Any, body: Any) -> tuple[str, str]:
 
 
 def _is_frame(said: Any) -> bool:
-    """Whether a record can be that of a `MapFrame` with a place on Earth."""
+    """Whether a record can be that of a `MapFrame`; one without a place has no coordinate
+    system.
+    """
     if not isinstance(said, dict) or not isinstance(said.get("origin"), list):
         return False
     origin = [real(v, -1e8, 1e8) for v in said["origin"]]
@@ -331,8 +333,7 @@ def _is_frame(said: Any) -> bool:
     return (
         len(origin) == 2
         and None not in origin
-        and isinstance(crs, str)
-        and _CRS.fullmatch(crs) is not None
+        and (crs is None or (isinstance(crs, str) and _CRS.fullmatch(crs) is not None))
         and all(v is None or real(v, -1e6, 1e6) is not None for v in numbers)
     )
 

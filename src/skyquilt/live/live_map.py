@@ -38,6 +38,7 @@ from skyquilt.live.local_pose import LocalPose
 from skyquilt.live.members import Members, Queues
 from skyquilt.live.neighbours import Neighbours
 from skyquilt.live.photo_intake import Intake, Refused
+from skyquilt.live.placeless import Placeless
 from skyquilt.live.redraw_queue import RedrawQueue
 from skyquilt.live.refinement import Refinement
 from skyquilt.live.settings import LiveSettings
@@ -157,6 +158,7 @@ class LiveMap:
             local_pose, self.redraw, map_events, self.queues, self.schedule
         )
         self.apply_adjustment = ApplyAdjustment(self.refinement)
+        self.placeless = Placeless(initial_pose=self.initial_pose, refinement=self.refinement)
         store = self.folder / STORE
         self.blocks = Blocks(
             self.members, self.schedule, self.settings, self.folder, store, self.methods
@@ -319,13 +321,19 @@ class LiveMap:
         """Refines a photo in two units of work, so that a photo that arrives in between need not
         wait for both.
         """
-        if not self.queues.untried or self.members.frame is None:
+        if (update := self.placeless.look()) is not None:
+            if self.placeless.over:
+                self.background.stop()
+                self._reload()
+            return update
+        if not self.queues.untried:
             return None
         member = self.queues.untried[0]
         with concerning(member.id):
             if member.state != "superseded" and not self.live_links.has_features(member.id):
                 self.live_links.features(member.id)
                 return Update(what="noted", photo=member.id)
+            self.placeless.due = True
             return self.refinement.refine(member)
 
     def _drawn_first(self) -> Update | None:

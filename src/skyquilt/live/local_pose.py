@@ -1,7 +1,8 @@
 """The pose of a photo from its links: an adjustment with a bounded number of neighbours."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.local_adjustment import AdjustedWindow, LocalAdjustment, Window
 from skyquilt.errors import AlignmentError, UnreadablePhotoError
 from skyquilt.live.drone_metadata import Metadata
+from skyquilt.live.kept_frame import in_frame_of
 from skyquilt.live.links import LiveLinks
 from skyquilt.live.members import Member, Members
 from skyquilt.live.neighbours import Neighbours
@@ -23,6 +25,8 @@ RING = 8
 """Number of photos held fixed around those that may move."""
 MOVING = 2
 """Number of linked photos that are adjusted together with a new one."""
+NO_MAP = "no photo has a position so far, and too few overlap for a map without a place"
+NOT_ON_MAP = "it overlaps other photos, but none that is on the map"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -72,10 +76,21 @@ class LocalPose:
             if self.live_links.shows_nothing(member.id, compared=bool(links)):
                 raise UnreadablePhotoError(ONE_TONE)
             why = "it matches none of its neighbours" if links else "there is no photo near it yet"
-            return Change(
-                moved={}, cameras={}, camera_of={}, links=links, xyz=np.zeros((0, 3)), reason=why
-            )
-        return self._joined(member, links, good)
+            return _unmoved(links, why)
+        if self.members.frame is None:
+            return _unmoved(links, NO_MAP)
+        change = self._joined(member, links, good)
+        found = change.moved.get(member.id) if member.pose is None else None
+        if found is None:
+            return change
+        # by its links alone a photo is compared with those that came before it: now its place tells
+        # which others it overlaps
+        near = [i for i in self.neighbours.of(member, found) if (i, member.id) not in links]
+        more = self.live_links.compared(member, near)
+        good |= {key: k for key, k in more.items() if k is not None}
+        links |= more
+        joined = self._joined(member, links, good) if any(more.values()) else change
+        return joined if member.id in joined.moved else change
 
     def _joined(
         self,
@@ -86,9 +101,11 @@ class LocalPose:
         whole = {member.id}
         for a, _ in good:
             whole |= self.members.block(a)
+        if all(self.members.by_id[i].pose is None for i in whole):
+            return _unmoved(links, NOT_ON_MAP)
         if self.settings.reposition and len(whole) <= YOUNG:
-            done = self._bundled(sorted(whole), good)
-            if isinstance(done, Alignment):
+            done = self.bundled(sorted(whole), good)
+            if done is not None:
                 ids = sorted(whole)
                 return Change(
                     moved={ids[k]: p for k, p in done.poses.items()},
@@ -100,14 +117,19 @@ class LocalPose:
                 )
         return self._adjusted_locally(member, links, good)
 
-    def _bundled(self, ids: Sequence[int], good: dict[tuple[int, int], Link]) -> Alignment | None:
-        """Adjusts a small block as a whole."""
+    def bundled(
+        self, ids: Sequence[int], more: Mapping[tuple[int, int], Link] = MappingProxyType({})
+    ) -> Alignment | None:
+        """Adjusts a small block as a whole, in the map's frame; `more`: links that are not stored
+        yet. None where it fails.
+        """
         where = {i: k for k, i in enumerate(ids)}
-        links = [_renumbered(k, where) for k in [*self.live_links.links_among(ids), *good.values()]]
+        known = [k for k in self.live_links.links_among(ids) if (k.a, k.b) not in more]
+        links = [_renumbered(k, where) for k in [*known, *more.values()]]
         members = [self.members.by_id[i] for i in ids]
         assert self.members.frame is not None
         try:
-            return self.young(
+            done = self.young(
                 [m.photo for m in members],
                 self.members.frame,
                 [m.prior for m in members],
@@ -116,6 +138,10 @@ class LocalPose:
             )
         except (AlignmentError, np.linalg.LinAlgError, ValueError):
             return None
+        before = {where[m.id]: m.pose for m in members if m.pose is not None}
+        if not self.members.placeless or not before:
+            return done
+        return in_frame_of(done, before, float(self.members.ledger.meta("ground", 0.0)))
 
     def _adjusted_locally(
         self,
@@ -141,14 +167,7 @@ class LocalPose:
         held = frozenset(ids) - moving - {member.id}
         done = self.adjust_locally(self.window(member, ids, held, list(good.values())))
         if not isinstance(done, AdjustedWindow):
-            return Change(
-                moved={},
-                cameras={},
-                camera_of={},
-                links=links,
-                xyz=np.zeros((0, 3)),
-                reason=done.reason,
-            )
+            return _unmoved(links, done.reason)
         for key in done.dropped:
             links[ids[key[0]], ids[key[1]]] = None
         moved = {ids[k]: p for k, p in done.poses.items()}
@@ -195,6 +214,13 @@ class LocalPose:
             ground=self.metadata.ground_at(at),
             sigma_xy=self.metadata.scatter(),
         )
+
+
+def _unmoved(links: dict[tuple[int, int], Link | None], reason: str) -> Change:
+    """No pose, and why."""
+    return Change(
+        moved={}, cameras={}, camera_of={}, links=links, xyz=np.zeros((0, 3)), reason=reason
+    )
 
 
 def _renumbered(link: Link, where: dict[int, int]) -> Link:

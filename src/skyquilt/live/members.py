@@ -39,6 +39,10 @@ LOOKED_BACK = 300
 """Photos of a camera by which it is told whether positions are rounded or repeat the one before."""
 COARSE = "coarse positions"
 """Name in the ledger of the number of photos that a note named last for that."""
+STAND_IN = "EPSG:3857"
+"""The projection in which the page draws a map without a place, about its origin, where its metres
+are those of the map. Nothing else is told of it as if the map were there.
+"""
 ON_MAP = ("placed", "refined")
 """States of photos that are drawn."""
 
@@ -123,13 +127,20 @@ class Members:
         for a, b in ledger.rows("select a, b from link where body is not null order by a, b"):
             self.joined(int(a), int(b))
 
+    @property
+    def placeless(self) -> bool:
+        """Whether there is a map, and nothing says where on Earth it is."""
+        return self.frame is not None and self.frame.crs is None
+
     def set_frame(self, frame: MapFrame) -> None:
         """Sets the map's frame; it does not change afterwards."""
-        self.frame = frame
-        self._to_map = Transformer.from_crs(4326, frame.crs, always_xy=True)
-        self._to_wgs = Transformer.from_crs(frame.crs, 4326, always_xy=True)
-        longitude, latitude = self._to_wgs.transform(*frame.origin)
-        self._began, self.near = sphere(np.array([[latitude, longitude]]))[0], []
+        self.frame, self.near = frame, []
+        self._to_wgs = Transformer.from_crs(frame.crs or STAND_IN, 4326, always_xy=True)
+        self._to_map, self._began = None, np.full(3, np.nan)
+        if frame.crs is not None:
+            self._to_map = Transformer.from_crs(4326, frame.crs, always_xy=True)
+            longitude, latitude = self._to_wgs.transform(*frame.origin)
+            self._began = sphere(np.array([[latitude, longitude]]))[0]
         for member in self.by_id.values():
             member.prior = self._prior(member)
         self._doubt_positions(list(self.by_id.values()))
@@ -332,7 +343,9 @@ class Members:
                 db.execute("insert or replace into camera values (?, ?)", (key, json.dumps(body)))
 
     def lonlat(self, xy: np.ndarray) -> list[list[float]]:
-        """Longitude and latitude of map coordinates (n, 2) in m."""
+        """Longitude and latitude of map coordinates (n, 2) in m; of a map without a place, where
+        the page draws it (`STAND_IN`).
+        """
         assert self.frame is not None
         assert self._to_wgs is not None
         x0, y0 = self.frame.origin

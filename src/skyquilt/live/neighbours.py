@@ -88,16 +88,20 @@ class Neighbours:
         ]
 
     def _latest(self, member: Member, most: int) -> list[int]:
-        found = []
+        """Those on the map, before them those that the photo is linked with; while the map has no
+        place, then others that wait, too: one begins with them, or they come to it together.
+        """
+        on_map, waiting = [], []
+        alone = self.members.frame is None or self.members.placeless
         for i in reversed(self.members.by_id):
             other = self.members.by_id[i]
-            if (
-                other.tried
-                and other.pose is not None
-                and other.photo.band == member.photo.band
-                and i != member.id
-            ):
-                found.append((other.source != member.source, i))
-            if len(found) >= most:
+            if other.tried and other.photo.band == member.photo.band and i != member.id:
+                found = (i not in member.links, other.source != member.source, i)
+                if other.pose is not None and (len(on_map) < most or not found[0]):
+                    on_map.append(found)
+                elif alone and other.state == "waiting" and len(waiting) < most:
+                    waiting.append(found)
+            if len(on_map) >= most and len(waiting) >= (most if alone else 0):
                 break
-        return [i for _, i in sorted(found, key=lambda f: f[0])]
+        first = sorted(on_map, key=lambda f: f[:2])[:most]
+        return [i for _, _, i in [*first, *sorted(waiting, key=lambda f: f[1])]]

@@ -70,19 +70,52 @@ class Refinement:
             self.heights(change.xyz, known=bool(change.cameras))
             self.move(change.moved, change.camera_of)
             if member.state == "refined":
-                self.local_pose.metadata.learn(member)
-                self.schedule.refined(member.id, loop=far)
+                self._learn(member, loop=far)
             why = change.reason
             if why and (note := self.members.far_note(member.photo)):
                 why = f"{why}; {note}"
             self.members.save(member, about=about_record(member, why), reason=why)
             for lost in found:
-                lost.tried, lost.again = 0, self._tried
-                self.members.save(lost, about=about_record(lost, ""))
+                self._again(lost)
             self.schedule.write(self.ledger)
             self.map_events.photo(member, reason=why)
         hit("photo refined")
         self.local_pose.neighbours.indexed(member)
+
+    def _learn(self, member: Member, *, loop: bool) -> None:
+        self.local_pose.metadata.learn(member)
+        self.schedule.refined(member.id, loop=loop)
+
+    def _again(self, lost: Member) -> None:
+        """Stores that a photo is to be compared again."""
+        lost.tried, lost.again = 0, self._tried
+        self.members.save(lost, about=about_record(lost, ""))
+
+    def begun_with(self, poses: dict[int, Pose], camera_of: dict[int, str]) -> list[Member]:
+        """Stores the poses of the photos with which a map without a place begins (inside a
+        transaction); those that are linked with them are compared again, see `take_back`.
+        """
+        for i, pose in poses.items():
+            member = self.members.by_id[i]
+            member.pose, member.camera, member.state = pose, camera_of[i], "refined"
+            self._learn(member, loop=False)
+            self.members.save(member, about=about_record(member, ""), reason="")
+            self.map_events.photo(member)
+        linked = {j for i in poses for j in self.members.by_id[i].links} - poses.keys()
+        found = [m for m in self.queues.lost if m.id in linked]
+        for lost in found:
+            self._again(lost)
+        self.schedule.write(self.ledger)
+        return found
+
+    def take_back(self, found: Iterable[Member]) -> None:
+        """Puts photos that `begun_with` returned back into the queue, and forgets those that found
+        a pose.
+        """
+        for lost in found:
+            self.queues.lost.remove(lost)
+            self.queues.untried.append(lost)
+        self.queues.lost = [m for m in self.queues.lost if m.state == "waiting"]
 
     def move(self, moved: dict[int, Pose], camera_of: dict[int, str]) -> None:
         """Stores new poses of photos (inside a transaction of the ledger)."""
@@ -130,11 +163,15 @@ class Refinement:
         return LOOP + 1
 
     def _found(self, member: Member, change: Change) -> list[Member]:
-        """Photos without links so far that match this one."""
+        """Photos without a pose so far that match this one."""
         if member.id not in change.moved and member.pose is None:
             return []
-        lost = [m for m in self.queues.lost if m.photo.band == member.photo.band][-LOST:]
-        return [m for m in lost if self._links(m, member)]
+        partners = {i for key, k in change.links.items() if k is not None for i in key}
+        partners |= member.links
+        lost = [m for m in self.queues.lost if m.photo.band == member.photo.band]
+        linked = [m for m in lost if m.id in partners and m.id not in change.moved]
+        others = [m for m in lost if m.id not in partners][-LOST:]
+        return [*linked, *(m for m in others if self._links(m, member))]
 
     def _links(self, lost: Member, member: Member) -> bool:
         return any(

@@ -26,6 +26,7 @@ from skyquilt.live.photo_intake import Intake
 from skyquilt.outside import plain
 from skyquilt.raster.map_source import MapSource
 from skyquilt.server.shown import Survey
+from skyquilt.server.survey import LiveSurvey
 
 RESUMABLE = "/photos/uploads"
 """The address of resumable uploads."""
@@ -281,7 +282,18 @@ class Context:
         """A layer by its name; None gives the first one. Its source is found in the same look: a
         moment later a final map may be gone.
         """
-        known = self.survey.layers()
+        return self._one_of(self.survey.layers(), name)
+
+    def drawn(self, name: str | None) -> tuple[str, MapSource]:
+        """The same for what the page draws: also layers of a map without a place."""
+        return self._one_of(self.survey.layers() | self.placeless(), name)
+
+    def placeless(self) -> dict[str, MapSource]:
+        """Layers of a growing map without a place; empty where there is none."""
+        return self.survey.placeless() if isinstance(self.survey, LiveSurvey) else {}
+
+    @staticmethod
+    def _one_of(known: dict[str, MapSource], name: str | None) -> tuple[str, MapSource]:
         if name is None and known:
             return next(iter(known.items()))
         if name is None or name not in known:

@@ -41,10 +41,10 @@ class MapEndpoints:
 
     def info(self) -> dict[str, Any]:
         """Describes the survey: layers with their extent in degrees, counts, number of the newest
-        event.
+        event. `placeless`: nothing says where the map is; its extents are where the page draws it.
         """
-        found = []
-        for name, source in self.context.survey.layers().items():
+        found, placeless = [], self.context.placeless()
+        for name, source in (placeless or self.context.survey.layers()).items():
             try:
                 bounds = source.bounds()
                 box = (
@@ -57,7 +57,8 @@ class MapEndpoints:
                 if isinstance(self.context.survey, FinishedSurvey):
                     raise
                 continue  # a final map is just being replaced
-            found.append({"name": name, "crs": source.crs, "bounds": box, **look})
+            crs = None if placeless else source.crs
+            found.append({"name": name, "crs": crs, "bounds": box, **look})
         counts = (
             self.context.survey.ledger.counts()
             if isinstance(self.context.survey, LiveSurvey)
@@ -70,6 +71,7 @@ class MapEndpoints:
         )
         return {
             "layers": found,
+            "placeless": bool(placeless),
             "growing": self.context.survey.growing and self.context.writer is not None,
             "counts": counts,
             "event": self.context.survey.version(),
@@ -103,7 +105,7 @@ class MapEndpoints:
         """A web tile (EPSG:3857, 256 px, WebP); 204 if the map is empty there, 304 if the client
         has the current version.
         """
-        name, source = self.context.layer(layer)
+        name, source = self.context.drawn(layer)
         if not (0 <= z <= 26 and 0 <= x < 2**z and 0 <= y < 2**z):
             raise HTTPException(404, f"there is no tile {z}/{x}/{y}")
         found = self.images.kept(name, z, x, y)

@@ -143,8 +143,10 @@ class PhotoViews:
     def _live_place(survey: LiveSurvey, number: int, lon: float, lat: float) -> dict[str, Any]:
         from skyquilt.server.live_projection import LiveProjection  # needed by few, slow to load
 
-        frame = survey.ledger.meta("frame")
-        x, y = between("EPSG:4326", frame["crs"]).transform(lon, lat) if frame else (0.0, 0.0)
+        crs = (survey.ledger.meta("frame") or {}).get("crs")
+        if crs is None:
+            raise HTTPException(404, "the map has no place")
+        x, y = between("EPSG:4326", crs).transform(lon, lat)
         try:
             found = LiveProjection(survey).pixel(number, x, y)
         except UnreadablePhotoError as error:

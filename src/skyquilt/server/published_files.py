@@ -81,7 +81,7 @@ class PublishedFiles:
         while told := self.survey.ledger.told(self._known):
             for _, kind, body in told:
                 said = json.loads(body)
-                if kind == "tiles" and said["layer"] == layer:
+                if kind == "tiles" and said["layer"] == layer and not said.get("placeless"):
                     self._boxes += changed_boxes(said)
             self._known = told[-1][0]
 

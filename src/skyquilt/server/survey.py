@@ -9,6 +9,7 @@ from typing import Any
 
 from skyquilt.errors import SideFileError, UsageError
 from skyquilt.live.ledger import NAME, Ledger, footprint_from
+from skyquilt.live.members import STAND_IN
 from skyquilt.outside import real
 from skyquilt.raster.map_source import FileSource, MapSource, TileSource
 from skyquilt.raster.tile_store import TileStore
@@ -75,23 +76,36 @@ class LiveSurvey:
         self._sources: dict[Path, tuple[tuple[int, int, int], FileSource]] = {}
 
     def layers(self) -> dict[str, MapSource]:
-        """Layers of the tiles, and the final map if there is one."""
-        frame, gsd = self.ledger.meta("frame"), self.ledger.meta("gsd")
-        found: dict[str, MapSource] = {}
-        if frame and gsd:
-            x, y = frame["origin"]
-            for layer in sorted(
-                self.tiles.layers(), key=lambda n: (not n.startswith("visible"), n)
-            ):
-                found[layer] = TileSource(
-                    tiles=self.tiles, layer=layer, crs=frame["crs"], origin=(x, y), gsd=gsd
-                )
+        """Layers of the tiles, if the map has a place, and the final map if there is one."""
+        frame = self.ledger.meta("frame")
+        found = self._tiled(frame["crs"]) if frame and frame["crs"] is not None else {}
         for name, final in self._final().items():
             with suppress(OSError, SideFileError):  # it is just being replaced
                 source = self._source(self.folder / FINISHED / final.file)
                 if source.crs:  # else it has no place to be shown at: its files are there
                     found[name] = source
         return found | self.base
+
+    def placeless(self) -> dict[str, MapSource]:
+        """Layers of a map without a place, for the page alone: about longitude and latitude 0, in
+        metres that are those of the map. Empty where there is a map with a place.
+        """
+        frame = self.ledger.meta("frame")
+        if not frame or frame["crs"] is not None or self.layers().keys() - self.base.keys():
+            return {}
+        return self._tiled(STAND_IN)
+
+    def _tiled(self, crs: str) -> dict[str, MapSource]:
+        """Layers of the tiles, visible ones first."""
+        frame, gsd = self.ledger.meta("frame"), self.ledger.meta("gsd")
+        names = sorted(self.tiles.layers(), key=lambda n: (not n.startswith("visible"), n))
+        if not frame or not gsd:
+            return {}
+        x, y = frame["origin"]
+        return {
+            name: TileSource(tiles=self.tiles, layer=name, crs=crs, origin=(x, y), gsd=gsd)
+            for name in names
+        }
 
     def _source(self, path: Path) -> FileSource:
         """A file of the final map, opened anew where it has been replaced.

@@ -146,5 +146,5 @@ const readPlace = async () => {
   try { const said = await asked(`at?lon=${at.lng}&lat=${at.lat}`); $("where").textContent = [degrees(at), placeText(said)].filter(Boolean).join(" · "); } catch { /* the degrees stay */ }
   setTimeout(() => { hovering = false; readPlace(); }, 120);
 };
-map.on("mousemove", (e) => { if (!state.fitted) return; $("where").textContent = degrees(e.latlng); hover = e.latlng; readPlace(); });
+map.on("mousemove", (e) => { if (!state.fitted || state.info.placeless) return; $("where").textContent = degrees(e.latlng); hover = e.latlng; readPlace(); });
 map.on("mouseout", () => { hover = null; $("where").textContent = ""; });

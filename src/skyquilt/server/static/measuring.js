@@ -117,6 +117,7 @@ document.addEventListener("keydown", (e) => { if (e.key === "Escape" && !$("big"
 map.getContainer().addEventListener("focus", () => { $("cross").hidden = !(state.mode || state.picking || document.body.classList.contains("keys")); });
 map.getContainer().addEventListener("blur", () => { $("cross").hidden = !(state.mode || state.picking); });
 const clicked = (at) => {
+  if (state.info && state.info.placeless) return;  // no photo is told to show a place
   photosHere(at).catch((error) => say(error.message));
 };
 const chosen = (at) => { state.picking ? state.picking(at) : state.mode ? addPoint(at) : clicked(at); };

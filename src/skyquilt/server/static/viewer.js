@@ -3,6 +3,8 @@
 const readInfo = async () => {
   const info = await asked("info"), finished = !info.growing;
   const done = state.info && state.info.finish !== "done" && info.finish === "done";
+  // a map that gets its place, or loses it, lies elsewhere in the page
+  if (state.info && state.info.placeless !== info.placeless) state.fitted = false;
   state.info = info;
   state.layers = new Map(info.layers.map((l) => [l.name, l]));
   state.last = Math.max(state.last, info.event);
@@ -37,18 +39,25 @@ const openFinal = async () => {
 const explain = () => {
   const some = boundsOf() !== null;
   $("empty").hidden = some;
+  const { growing, counts, finish, placeless } = state.info, waiting = counts.waiting || 0;
   // nothing is shown that cannot be used
-  for (const id of ["export", "fit", "distance", "area", "prints", "tracks"]) $(id).hidden = !some;
+  for (const id of ["export", "distance", "area", "prints", "tracks"]) $(id).hidden = !some || placeless;
+  for (const id of ["fit", "fade"]) $(id).hidden = !some;
   $("layer").parentElement.hidden = !some;
-  $("fade").hidden = !some;
-  const { growing, counts, finish } = state.info, waiting = counts.waiting || 0;
+  $("base").hidden = placeless;
+  if (placeless && isPressed("base")) $("base").onclick();
+  if (placeless && state.mode) setMode(null);
+  document.body.classList.toggle("placeless", placeless);
+  $("placeless").hidden = !placeless;
+  $("placeless").textContent = "No photo has a position so far: this map has no place and no scale, and its north may be wrong. Once a photo with a position overlaps it, it is begun again with its place."
+    + (finish === "done" ? " The final map is under Downloads." : "");
   if (!some && !waiting) $("finish").hidden = true;
   if (some) return;
   const placeless = ["This map has no place on Earth", "Its photos have no positions. The report shows it."];
   const [head, text] = !growing ? placeless
     : finish === "done" ? ["The final map has no place on Earth", "Its photos have no positions. It is under Downloads, with its report."]
-    : waiting ? ["No photo has a position so far", "The map begins with the first photo that has one. A flight without any is mapped at its end: Finish flight."]
-    : ["No photo is on the map yet", "Copy photos into the watched folder, send them over HTTP, or drop them here. The map begins with the first photo that has a position; others wait until they can be linked to it."];
+    : waiting ? ["No photo has a position so far", "The map begins with the first photo that has one, or, without a place, with four that overlap."]
+    : ["No photo is on the map yet", "Copy photos into the watched folder, send them over HTTP, or drop them here. The map begins with the first photo that has a position, or with four that overlap; others wait until they can be linked to it."];
   $("empty").replaceChildren(element("h2", head), element("p", text));
 };
 let again = null;
