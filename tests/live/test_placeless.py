@@ -64,7 +64,9 @@ def test_an_adjustment_comes_back_into_the_frame_of_the_map(count):
     """
     rng = np.random.default_rng(count)
     angles = rng.uniform((-180, -8, -8), (180, 8, 8), (count + 3, 3))
-    centres = np.column_stack([rng.uniform(-40, 40, (count + 3, 2)), rng.uniform(45, 55, count + 3)])
+    centres = np.column_stack(
+        [rng.uniform(-40, 40, (count + 3, 2)), rng.uniform(45, 55, count + 3)]
+    )
     motion = Motion(shift_m=np.array([0.2, -0.1, 0.0]), turn_rad=np.full(3, 1e-3))
     poses = {
         i: Pose(cam_R_map=cam_R_map_from_angles(*angles[i]), map_C=centres[i], motion=motion)
@@ -110,7 +112,11 @@ def test_without_positions_the_map_begins_with_four_and_tells_no_place(flight, t
         assert {(n["name"], n["crs"]) for n in info["layers"]} >= {("visible", None)}
         west, south, east, north = info["layers"][0]["bounds"]
         assert -0.01 < west < 0 < east < 0.01 and -0.01 < south < 0 < north < 0.01
-        about = [f"/tiles/18/{x}/{y}?layer=visible" for x in (2**17 - 1, 2**17) for y in (2**17 - 1, 2**17)]
+        about = [
+            f"/tiles/18/{x}/{y}?layer=visible"
+            for x in (2**17 - 1, 2**17)
+            for y in (2**17 - 1, 2**17)
+        ]
         assert 200 in [site.web.get(tile).status_code for tile in about]
         for photo in site.web.get("/photos").json()["photos"]:
             assert photo["at"] is None and not photo["ring"]
@@ -172,7 +178,9 @@ def test_it_goes_on_after_a_restart_and_after_being_killed(flight, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_map_without_a_place_that_began_with_few_others_is_begun_again(flight, tmp_path, tmp_path_factory):
+def test_a_map_without_a_place_that_began_with_few_others_is_begun_again(
+    flight, tmp_path, tmp_path_factory
+):
     """The first photos show another place, and are not linked with the flight."""
     other = made(tmp_path_factory, "elsewhere", seed=77, route=Route(photos=4))
     first = placeless(other.photos, tmp_path / "other")

@@ -1,6 +1,7 @@
 """Chooses the photos with which a new one is compared, by a spatial index of camera positions."""
 
 from collections import defaultdict
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -46,7 +47,7 @@ class Neighbours:
 
     def of(self, member: Member, pose: Pose | None, most: int = NEIGHBOURS) -> list[int]:
         """Photos of the same spectral band that were compared before, nearest first. If the
-        position is unknown: the latest ones.
+        position is unknown: those that came next before or after it.
         """
         if pose is None:
             return self._latest(member, most)
@@ -88,20 +89,29 @@ class Neighbours:
         ]
 
     def _latest(self, member: Member, most: int) -> list[int]:
-        """Those on the map, before them those that the photo is linked with; while the map has no
-        place, then others that wait, too: one begins with them, or they come to it together.
+        """Those on the map that the photo is linked with, then those that came nearest before or
+        after it; while the map has no place, then others that wait, too: one begins with them, or
+        they come to it together.
         """
-        on_map, waiting = [], []
         alone = self.members.frame is None or self.members.placeless
-        for i in reversed(self.members.by_id):
-            other = self.members.by_id[i]
-            if other.tried and other.photo.band == member.photo.band and i != member.id:
-                found = (i not in member.links, other.source != member.source, i)
-                if other.pose is not None and (len(on_map) < most or not found[0]):
+        on_map, waiting = list[tuple[bool, int]](), list[tuple[bool, int]]()
+        linked = [self.members.by_id[i] for i in sorted(member.links)]
+        for other in self._outward(member.id):
+            if other.tried and other.photo.band == member.photo.band:
+                found = other.source != member.source, other.id
+                if other.pose is not None and len(on_map) < most:
                     on_map.append(found)
                 elif alone and other.state == "waiting" and len(waiting) < most:
                     waiting.append(found)
-            if len(on_map) >= most and len(waiting) >= (most if alone else 0):
+            if len(on_map) >= most and (len(waiting) >= most or not alone):
                 break
-        first = sorted(on_map, key=lambda f: f[:2])[:most]
-        return [i for _, _, i in [*first, *sorted(waiting, key=lambda f: f[1])]]
+        near = [i for found in (on_map, waiting) for _, i in sorted(found, key=lambda f: f[0])]
+        return list(dict.fromkeys([m.id for m in linked if m.pose is not None][:most] + near))
+
+    def _outward(self, number: int) -> Iterator[Member]:
+        """All photos but this one, those that were accepted next before or after it first."""
+        known = self.members.by_id
+        for apart in range(1, max(known, default=0) + 1):
+            for i in (number - apart, number + apart):
+                if i in known:
+                    yield known[i]

@@ -17,7 +17,9 @@ from skyquilt.model.poses import Pose
 LOOP = 12
 """A new link closes a loop if its photos were more than this number of links apart."""
 LOST = 2
-"""Number of photos without links with which a refined photo is compared."""
+"""Number of photos without links, those that came next before or after it, with which a refined
+photo is compared.
+"""
 
 
 class Refinement:
@@ -48,8 +50,9 @@ class Refinement:
         self._commit(member, change, found)
         self.queues.untried.popleft()
         self._requeue(member, found)
+        alone = "waiting" if self.members.frame is None else "loose"
         return Update(
-            what="refined" if member.state == "refined" else "loose",
+            what="refined" if member.state == "refined" else alone,
             photo=member.id,
             moved=tuple(change.moved),
             text=change.reason,
@@ -170,7 +173,9 @@ class Refinement:
         partners |= member.links
         lost = [m for m in self.queues.lost if m.photo.band == member.photo.band]
         linked = [m for m in lost if m.id in partners and m.id not in change.moved]
-        others = [m for m in lost if m.id not in partners][-LOST:]
+        others = sorted(
+            (m for m in lost if m.id not in partners), key=lambda m: (abs(m.id - member.id), -m.id)
+        )[:LOST]
         return [*linked, *(m for m in others if self._links(m, member))]
 
     def _links(self, lost: Member, member: Member) -> bool:

@@ -53,8 +53,8 @@ const explain = () => {
     + (finish === "done" ? " The final map is under Downloads." : "");
   if (!some && !waiting) $("finish").hidden = true;
   if (some) return;
-  const placeless = ["This map has no place on Earth", "Its photos have no positions. The report shows it."];
-  const [head, text] = !growing ? placeless
+  const nowhere = ["This map has no place on Earth", "Its photos have no positions. The report shows it."];
+  const [head, text] = !growing ? nowhere
     : finish === "done" ? ["The final map has no place on Earth", "Its photos have no positions. It is under Downloads, with its report."]
     : waiting ? ["No photo has a position so far", "The map begins with the first photo that has one, or, without a place, with four that overlap."]
     : ["No photo is on the map yet", "Copy photos into the watched folder, send them over HTTP, or drop them here. The map begins with the first photo that has a position, or with four that overlap; others wait until they can be linked to it."];
