@@ -16,10 +16,10 @@ from skyquilt.live.settings import LiveSettings
 from skyquilt.model.poses import Alignment, MapFrame, Motion, Pose, no_ties
 from skyquilt.server.published_files import PublishedFiles
 from skyquilt.server.survey import LiveSurvey
-from tests.end_to_end.conftest import relabel
-from tests.live.conftest import fed, made, offsets, served
-from tests.live.test_crash import replay, same
 from skyquilt.simulate.settings import Route
+from tests.end_to_end.conftest import relabel
+from tests.live.conftest import fed, made, served
+from tests.live.test_crash import replay, same
 from tests.live.test_elsewhere import notes
 
 QUICK = LiveSettings(features=600)
