@@ -3,6 +3,7 @@
 from collections import OrderedDict
 from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -21,7 +22,7 @@ from skyquilt.live.members import Member, Members
 from skyquilt.model.features import Features, Link, numbers
 from skyquilt.workflows.links import link_pair, marked_in
 from skyquilt.workflows.methods import Methods
-from skyquilt.workflows.photo_features import photo_features, picture_of
+from skyquilt.workflows.photo_features import PhotoFeatures, photo_features, picture_of
 
 FEATURES_KEPT = 48
 """Number of photos whose features are kept in memory."""
@@ -38,7 +39,7 @@ class LiveLinks:
         self, members: Members, methods: Methods, store: Store, pixels: PixelCache[NDArray[Any]]
     ) -> None:
         self.members, self.methods, self.store, self.pixels = members, methods, store, pixels
-        self._features: OrderedDict[int, Features] = OrderedDict()
+        self._features: OrderedDict[int, PhotoFeatures] = OrderedDict()
         self.marks = LiveMarks(members, self.features)
         self.lenses = LiveLenses(members, self.features)
 
@@ -48,16 +49,23 @@ class LiveLinks:
 
     def features(self, number: int) -> Features:
         """Features of a photo: from memory, from the store, or computed now."""
+        return self._look(number).features
+
+    def detail(self, number: int) -> NDArray[np.float32]:
+        """(rows, columns, 3) how sharp a photo is in its cells (`imaging.grey.detail`)."""
+        return self._look(number).detail
+
+    def _look(self, number: int) -> PhotoFeatures:
         if number in self._features:
             self._features.move_to_end(number)
             return self._features[number]
         photo, pixels = self.members.by_id[number].photo, self.pixels
         with concerning(number):
             look = photo_features(photo, lambda: pixels(number), self.methods.detector, self.store)
-        self._features[number] = look.features
+        self._features[number] = replace(look, thumbnail=look.thumbnail[:0])  # not needed here
         while len(self._features) > FEATURES_KEPT:
             self._features.popitem(last=False)
-        return look.features
+        return look
 
     def shows_nothing(self, number: int, *, compared: bool) -> bool:
         """Whether a photo without links is black or white all over. One that could not be compared

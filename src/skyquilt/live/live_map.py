@@ -27,6 +27,7 @@ from skyquilt.errors import OutputError, UnreadablePhotoError, UsageError
 from skyquilt.live.adjustment_schedule import Blocks, Schedule
 from skyquilt.live.apply_adjustment import ApplyAdjustment
 from skyquilt.live.background_adjustment import BackgroundAdjustment, adjust_block
+from skyquilt.live.blur import LiveBlur
 from skyquilt.live.drone_metadata import Metadata
 from skyquilt.live.events import MapEvents, Update
 from skyquilt.live.failures import MemberFailedError, concerning, of_the_system
@@ -139,6 +140,7 @@ class LiveMap:
         metadata = Metadata(self.members, self.heights, self.settings)
         neighbours = Neighbours(self.members, metadata)
         self.live_links = LiveLinks(self.members, self.methods, self.store, self.full)
+        blur = LiveBlur(self.live_links)
         local_pose = LocalPose(self.members, metadata, neighbours, self.live_links, self.settings)
         self.canvas = Canvas(
             self.tiles,
@@ -148,6 +150,7 @@ class LiveMap:
             self.store,
             self.settings.max_view_angle,
             self.live_links.marks.shown,
+            blur.blurred,
         )
         self.canvas.gsd = float(self.ledger.meta("gsd", 0.0))
         self.canvas.ground = float(self.ledger.meta("ground", 0.0))
@@ -155,7 +158,7 @@ class LiveMap:
         self.redraw = RedrawQueue(self.members, self.canvas, map_events)
         self.initial_pose = InitialPose(metadata, self.full, self.redraw, map_events, self.queues)
         self.refinement = Refinement(
-            local_pose, self.redraw, map_events, self.queues, self.schedule
+            local_pose, self.redraw, map_events, self.queues, self.schedule, blur
         )
         self.apply_adjustment = ApplyAdjustment(self.refinement)
         self.placeless = Placeless(initial_pose=self.initial_pose, refinement=self.refinement)

@@ -13,6 +13,7 @@ from pyproj import Transformer
 
 from skyquilt.alignment.local_adjustment import TURNED
 from skyquilt.alignment.priors import empty_prior, photo_prior
+from skyquilt.live.doubled import tell_doubled
 from skyquilt.live.failures import concerning
 from skyquilt.live.inbox import Inbox
 from skyquilt.live.ledger import DAMAGED, Ledger
@@ -150,7 +151,7 @@ class Members:
         receiver do, deviations as large as they are (`with_coarse_deviations`). Photos are noted
         whenever there are twice as many of them.
         """
-        noted, coarse, notes = int(self.ledger.meta(COARSE, 0)), 0, list[str]()
+        coarse, notes = 0, list[str]()
         for key in dict.fromkeys(m.photo.camera_key for m in new):
             alike = (m for m in reversed(self.by_id.values()) if m.photo.camera_key == key)
             located = (m for m in alike if np.isfinite(m.prior.map_C[0]))
@@ -166,11 +167,7 @@ class Members:
                     member.prior = replace(member.prior, sigma_C=sigma)
             coarse += sum(a is not m.photo for a, m in zip(photos, own, strict=True))
             notes += said
-        if coarse >= max(1, 2 * noted):
-            with self.ledger.change():
-                self.ledger.put_meta(COARSE, coarse)
-                for note in notes:
-                    self.ledger.tell("note", {"text": f"So far: {note}"})
+        tell_doubled(self.ledger, COARSE, coarse, lambda: [f"So far: {note}" for note in notes])
 
     def _prior(self, member: Member) -> Prior:
         """The prior of a photo in the map's frame; a position far away is not used."""

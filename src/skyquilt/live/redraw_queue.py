@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.live.doubled import tell_doubled
 from skyquilt.live.events import MapEvents, Update
 from skyquilt.live.failures import concerning
 from skyquilt.live.ledger import DAMAGED, hit
@@ -13,15 +14,14 @@ from skyquilt.live.members import Member, Members, pose_from, pose_record
 from skyquilt.live.tile_drawing import LEAST_MOVE, NEWEST, Canvas
 from skyquilt.model.poses import Pose
 from skyquilt.ortho.spoilt import overexposed_note
-from skyquilt.outside import whole
 from skyquilt.raster.tile_store import Address
 
 DRAWN_AT_ONCE = 12
 """Number of tiles drawn in one unit of work; twice as many for a new photo."""
 NOTED_AT_ONCE = 8
 """Number of moved photos whose tiles are determined in one unit of work."""
-WHITE, MOST_NOTED = "overexposed", 10**9
-"""Name in the ledger of the number of overexposed photos that were noted last, and most of them."""
+WHITE = "overexposed"
+"""Name in the ledger of the number of overexposed photos that were noted last."""
 Queue = dict[Address, set[int]]
 """Tiles to draw, in order, with the photos that have changed on each."""
 
@@ -46,7 +46,6 @@ class RedrawQueue:
         self._to_draw: set[int] = set()
         self._fresh: dict[str, list[Address]] = {}
         self._remarked: set[int] = set()
-        self._noted = whole(self.ledger.meta(WHITE, 0), 0, MOST_NOTED) or 0
         self._take_up()
 
     def _take_up(self) -> None:
@@ -74,13 +73,15 @@ class RedrawQueue:
         are noted whenever there are twice as many of them.
         """
         addresses = self.canvas.place(member, self.members.camera(member))
-        white = self.canvas.white() if self.canvas.is_white(member.id) else []
-        if len(white) >= max(1, 2 * self._noted):
-            self._noted = len(white)
-            note = overexposed_note([self.members.by_id[i].photo.name for i in white])
-            with self.ledger.change():
-                self.ledger.put_meta(WHITE, self._noted)
-                self.ledger.tell("note", {"text": note if len(white) < 2 else f"So far {note}"})
+        if self.canvas.is_white(member.id):
+            white = [self.members.by_id[i].photo.name for i in self.canvas.white()]
+            note = overexposed_note(white)
+            tell_doubled(
+                self.ledger,
+                WHITE,
+                len(white),
+                lambda: [note if len(white) < 2 else f"So far {note}"],
+            )
         return addresses
 
     def _look_for_marks(self, member: Member) -> None:
@@ -89,8 +90,13 @@ class RedrawQueue:
         if self.canvas.remarked(camera):
             for other in self.members.on_map():
                 if other.photo.camera_key == camera:
-                    self._remarked.add(other.id)
-                    self.changed(other)
+                    self.altered(other)
+
+    def altered(self, member: Member) -> None:
+        """Notes that another part of a photo is shown than before, wherever it lies."""
+        if member.pose is not None and member.state != "superseded":
+            self._remarked.add(member.id)
+            self.changed(member)
 
     def changed(self, member: Member) -> None:
         """Notes that a photo looks different; its tiles are determined later."""

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.live.adjustment_schedule import Schedule
+from skyquilt.live.blur import LiveBlur
 from skyquilt.live.events import MapEvents, Update
 from skyquilt.live.ledger import hit
 from skyquilt.live.links import link_bytes
@@ -34,10 +35,12 @@ class Refinement:
         map_events: MapEvents,
         queues: Queues,
         schedule: Schedule,
+        blur: LiveBlur,
     ) -> None:
         self.local_pose, self.redraw, self.map_events = local_pose, redraw, map_events
         self.queues, self.schedule = queues, schedule
         self.members, self.ledger = local_pose.members, local_pose.members.ledger
+        self.blur = blur
         self._tried = max((m.tried for m in self.members.by_id.values()), default=0)
 
     def refine(self, member: Member) -> Update:
@@ -82,7 +85,10 @@ class Refinement:
                 self._again(lost)
             self.schedule.write(self.ledger)
             self.map_events.photo(member, reason=why)
+            blurred = self.blur.look(member)
         hit("photo refined")
+        for other in blurred:
+            self.redraw.altered(other)
         self.local_pose.neighbours.indexed(member)
 
     def _learn(self, member: Member, *, loop: bool) -> None:

@@ -120,8 +120,11 @@ class Canvas:
         store: Store,
         max_view_angle: float,
         marks: Callable[[str], Blank | None],
+        blurred: Collection[int],
     ) -> None:
-        """`marks`: what the photos of a camera (its key) all show at one place of the picture."""
+        """`marks`: what the photos of a camera (its key) all show at one place of the picture;
+        `blurred`: photos that are blurred, now and later.
+        """
         self.tiles, self.heights, self.members = tiles, heights, members
         self.gsd = 0.0
         self.ground = 0.0
@@ -136,7 +139,7 @@ class Canvas:
         self._by_tile: dict[Address, set[int]] = defaultdict(set)
         self._pictures = SmallPictures(full, members, store)
         self._white: dict[int, Blank | None] = {}
-        self._marks = marks
+        self._marks, self._blurred = marks, blurred
         self._marked: dict[str, Blank | None] = {}
         self._tone = Tone(self._pictures)
 
@@ -212,6 +215,8 @@ class Canvas:
         fixed = self._marks(member.photo.camera_key)
         bad = [replace(fixed, size=(w, h))] if fixed is not None else []
         bad += [white] if (white := self._overexposed(member, (w, h))) is not None else []
+        if member.id in self._blurred:
+            bad.append(Blank(room=np.full((2, 2), -1, np.float32), size=(w, h)))
         if bad:
             limits = replace(limits, mark=reduce(joined, bad))
         outline = footprint(small, pose, surface, limits=limits)

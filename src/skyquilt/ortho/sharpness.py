@@ -88,7 +88,7 @@ def find_blurred(
             photos[k]: Blank(room=np.full((2, 2), -1, np.float32), size=size) for k in blurred
         }
         if len(blurred):
-            notes.append(_note([names[photos[k]] for k in blurred]))
+            notes.append(blurred_note([names[photos[k]] for k in blurred]))
         sharp = np.setdiff1d(own, blurred)
         spot = _spot(off[sharp, ..., 2] - each[sharp, None, None, 2])
         if spot.any():
@@ -103,7 +103,8 @@ def find_blurred(
     return found, tuple(notes)
 
 
-def _note(names: Sequence[str]) -> str:
+def blurred_note(names: Sequence[str]) -> str:
+    """A note about blurred photos of these names, at least one."""
     some = f"{len(names)} photos are" if len(names) > 1 else "One photo is"
     return (
         f"{some} blurred against others of the same ground ({sentence_of(names)}): gusts, a long"
