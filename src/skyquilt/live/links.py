@@ -3,7 +3,6 @@
 from collections import OrderedDict
 from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -55,6 +54,10 @@ class LiveLinks:
         """(rows, columns, 3) how sharp a photo is in its cells (`imaging.grey.detail`)."""
         return self._look(number).detail
 
+    def thumbnail(self, number: int) -> NDArray[np.uint8]:
+        """A photo reduced, (h, w[, bands])."""
+        return self._look(number).thumbnail
+
     def _look(self, number: int) -> PhotoFeatures:
         if number in self._features:
             self._features.move_to_end(number)
@@ -62,7 +65,7 @@ class LiveLinks:
         photo, pixels = self.members.by_id[number].photo, self.pixels
         with concerning(number):
             look = photo_features(photo, lambda: pixels(number), self.methods.detector, self.store)
-        self._features[number] = replace(look, thumbnail=look.thumbnail[:0])  # not needed here
+        self._features[number] = look
         while len(self._features) > FEATURES_KEPT:
             self._features.popitem(last=False)
         return look

@@ -13,6 +13,7 @@ from skyquilt.live.links import link_bytes
 from skyquilt.live.local_pose import Change, LocalPose
 from skyquilt.live.members import Member, Queues, about_record
 from skyquilt.live.redraw_queue import RedrawQueue
+from skyquilt.live.thermal_notes import ThermalNotes
 from skyquilt.model.poses import Pose
 
 LOOP = 12
@@ -40,7 +41,7 @@ class Refinement:
         self.local_pose, self.redraw, self.map_events = local_pose, redraw, map_events
         self.queues, self.schedule = queues, schedule
         self.members, self.ledger = local_pose.members, local_pose.members.ledger
-        self.blur = blur
+        self.blur, self.thermal_notes = blur, ThermalNotes(blur.live_links)
         self._tried = max((m.tried for m in self.members.by_id.values()), default=0)
 
     def refine(self, member: Member) -> Update:
@@ -86,6 +87,7 @@ class Refinement:
             self.schedule.write(self.ledger)
             self.map_events.photo(member, reason=why)
             blurred = self.blur.look(member)
+            self.thermal_notes.look(member)
         hit("photo refined")
         for other in blurred:
             self.redraw.altered(other)

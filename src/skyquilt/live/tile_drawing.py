@@ -69,6 +69,10 @@ MOST_CELLS = 1000
 """Largest number of height cells along a side of the surface below a photo."""
 NEWEST = "-newest"
 """Suffix of the names of layers that show the newest photo instead of the most vertical view."""
+COUNTS, COLOURS = "thermal-counts", "thermal-colours"
+"""Layers of thermal photos whose values are of no known unit, and of those that hold the colours of
+a palette; `thermal` has degrees Celsius.
+"""
 MOST_VIEWS = 24
 """Largest number of photos from which a tile is composed."""
 LEAST_MOVE = 0.6
@@ -98,8 +102,13 @@ class Drawing:
 
 
 def layer_of(member: Member) -> str:
-    """The layer that shows a photo: one per spectral band."""
-    return member.photo.band
+    """The layer that shows a photo: one per spectral band, and of thermal photos one for each kind
+    of values, so that no layer joins degrees, counts and colours.
+    """
+    photo = member.photo
+    if photo.band != "thermal" or photo.unit == "celsius":
+        return photo.band
+    return COUNTS if photo.unit else COLOURS
 
 
 def _most_tiles(member: Member) -> float:
@@ -228,7 +237,7 @@ class Canvas:
 
     def _overexposed(self, member: Member, size: tuple[int, int]) -> Blank | None:
         """Where a photo, drawn at this width and height in px, is overexposed; looked for once."""
-        if layer_of(member) == "thermal":  # white is warm
+        if member.photo.band == "thermal":  # white is warm
             return None
         if member.id not in self._white:
             small = shrink(self._pictures(member.id), LOOKED_AT)[0]
@@ -409,7 +418,7 @@ class Canvas:
         return Tile(pixels=np.nan_to_num(done.pixels), shown=shown) if shown.any() else None
 
     def _empty(self, layer: str) -> Tile:
-        thermal = layer.startswith("thermal")
+        thermal = layer.removesuffix(NEWEST) in ("thermal", COUNTS)
         pixels = (
             np.zeros((SIDE, SIDE, 1), np.float32)
             if thermal

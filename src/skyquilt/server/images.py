@@ -89,7 +89,8 @@ class Images:
 
     def unit(self, layer: str) -> str:
         """Unit of a layer's values as printed; empty where they have none."""
-        return unit_of(self.style(layer), self.survey.figures())
+        growing = self.survey.unit(layer) if isinstance(self.survey, LiveSurvey) else ""
+        return growing or unit_of(self.style(layer), self.survey.figures())
 
     def _forget_changed(self) -> None:
         """Removes cached tiles whose content was redrawn since the last call."""

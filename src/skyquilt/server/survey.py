@@ -13,7 +13,7 @@ from skyquilt.live.members import STAND_IN
 from skyquilt.outside import real
 from skyquilt.raster.map_source import FileSource, MapSource, TileSource
 from skyquilt.raster.tile_store import TileStore
-from skyquilt.runs.layers import RunLayer, figures_of, is_tiff, layers_in
+from skyquilt.runs.layers import UNITS, RunLayer, figures_of, is_tiff, layers_in
 from skyquilt.server.finished_survey import FinishedSurvey
 from skyquilt.server.shown import Shown, base_map
 
@@ -24,9 +24,26 @@ GROWING = {
     "thermal-newest": RunLayer(
         name="thermal", title="Thermal, newest on top", file="", measured=True
     ),
+    "thermal-counts": RunLayer(
+        name="thermal-counts", title="Thermal, values without a unit", file="", measured=True
+    ),
+    "thermal-counts-newest": RunLayer(
+        name="thermal-counts",
+        title="Thermal, values without a unit, newest on top",
+        file="",
+        measured=True,
+    ),
+    "thermal-colours": RunLayer(
+        name="thermal-colours", title="Thermal, a palette's colours", file=""
+    ),
+    "thermal-colours-newest": RunLayer(
+        name="thermal-colours", title="Thermal, a palette's colours, newest on top", file=""
+    ),
     "base": RunLayer(name="base", title="Older map", file=""),
 }
 """How growing maps are shown."""
+GROWING_UNITS = {"thermal": "celsius", "thermal-counts": "counts"}
+"""Units of the values of growing maps."""
 PHOTOS, TILES, FINISHED = "photos", "tiles.db", "finished"
 
 
@@ -141,6 +158,11 @@ class LiveSurvey:
             if number > 1
         }
         return GROWING | older | final
+
+    def unit(self, layer: str) -> str:
+        """Unit of a growing map's values as printed; empty for other layers."""
+        style = GROWING.get(layer)
+        return UNITS.get(GROWING_UNITS.get(style.name, "") if style else "", "")
 
     def figures(self) -> Mapping[str, Any]:
         """The figures of the final map; empty while there is none."""
