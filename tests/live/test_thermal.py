@@ -1,14 +1,19 @@
 """A thermal camera beside a visible one: two layers over one ground."""
 
 import io
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import rasterio
 from PIL import Image
 
+from skyquilt.live.ledger import Ledger
 from skyquilt.live.settings import LiveSettings
+from skyquilt.live.tile_drawing import layer_of
 from skyquilt.raster.map_source import TileSource
+from skyquilt.raster.tile_store import TileStore
+from skyquilt.server.survey import LiveSurvey
 from tests.live.conftest import served
 from tests.live.test_http import middle, tile_of
 
@@ -64,3 +69,24 @@ def measured(live, both):
     # notice
     assert abs(np.median(off)) < 0.4
     assert np.corrcoef(seen[known], true[known])[0, 1] > 0.6
+
+
+@pytest.mark.parametrize(
+    "band, unit, layer",
+    [
+        ("visible", "", "visible"),
+        ("thermal", "celsius", "thermal"),
+        ("thermal", "counts", "thermal-counts"),
+        ("thermal", "", "thermal-colours"),
+    ],
+)
+def test_no_layer_joins_degrees_counts_and_colours(band, unit, layer, tmp_path):
+    """Each has its own unit on the page, and colours have none: they are no measurements."""
+    member = SimpleNamespace(photo=SimpleNamespace(band=band, unit=unit))
+    assert layer_of(member) == layer
+    Ledger(tmp_path, write=True).close()
+    TileStore(tmp_path / "tiles.db", write=True).close()
+    survey = LiveSurvey(tmp_path)
+    for name in (layer, f"{layer}-newest"):
+        assert survey.unit(name) == {"celsius": "°C", "counts": "counts"}.get(unit, "")
+        assert survey.styles()[name].measured == bool(unit)
