@@ -195,3 +195,19 @@ def test_a_map_without_a_place_that_began_with_few_others_is_begun_again(
     assert shown == {p.name for p in larger.photos}
     assert np.abs(misfit(live, larger)).max() < 0.3
     live.close()
+
+
+@pytest.mark.slow
+def test_a_photo_that_is_linked_with_one_that_waits_is_placed(tmp_path, tmp_path_factory):
+    """A photo that hangs on the others by too little waits with its links; the map goes on."""
+    flown = made(tmp_path_factory, "larger", seed=3, route=Route(photos=12))
+    photos = placeless(flown.photos, tmp_path / "in")
+    live = fed(LiveMap(tmp_path / "out", QUICK), photos[:11])
+    waits = live.members.by_id[11]
+    waits.pose, waits.state = None, "waiting"
+    with live.ledger.change():
+        live.members.save(waits)
+    live.add(photos[11])
+    assert live.ledger.counts()["refused"] == 0
+    assert live.members.by_id[12].state == "refined"
+    live.close()

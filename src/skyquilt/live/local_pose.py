@@ -165,7 +165,9 @@ class LocalPose:
         kept = sorted(ring, key=lambda j: (-len(self.members.by_id[j].links & moving), j))[:RING]
         ids = sorted({member.id, *direct, *kept})
         held = frozenset(ids) - moving - {member.id}
-        done = self.adjust_locally(self.window(member, ids, held, list(good.values())))
+        # links with photos that have no pose, as those that wait, tell nothing here
+        usable = [k for (a, _), k in good.items() if a in direct]
+        done = self.adjust_locally(self.window(member, ids, held, usable))
         if not isinstance(done, AdjustedWindow):
             return _unmoved(links, done.reason)
         for key in done.dropped:
