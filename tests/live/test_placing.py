@@ -47,7 +47,7 @@ def test_a_young_block_has_a_prior_for_each_of_its_photos(live, monkeypatch):
         raise AlignmentError("that is enough")
 
     monkeypatch.setattr(live.refinement.local_pose, "young", stop)
-    live.refinement.local_pose._bundled([1, 2, 3, 4], {})
+    live.refinement.local_pose.bundled([1, 2, 3, 4])
     assert of_own_photo(live, *given[0])
 
 

@@ -54,6 +54,10 @@ def hit(name: str) -> None:
 
 DAMAGED = (ValueError, TypeError, LookupError, AttributeError, OverflowError, RecursionError)
 """What reading a record raises that nobody of ours has written."""
+STAND_IN = "EPSG:3857"
+"""The projection in which the page draws a map without a place, about its origin, where its metres
+are those of the map. Nothing else is told of it as if the map were there.
+"""
 NAME = "live.db"
 """Name of the file in the survey's folder."""
 FORMAT = 1

@@ -16,7 +16,7 @@ from skyquilt.alignment.priors import empty_prior, photo_prior
 from skyquilt.live.doubled import tell_doubled
 from skyquilt.live.failures import concerning
 from skyquilt.live.inbox import Inbox
-from skyquilt.live.ledger import DAMAGED, Ledger
+from skyquilt.live.ledger import DAMAGED, STAND_IN, Ledger
 from skyquilt.live.settings import LiveSettings
 from skyquilt.matching.lens_kind import as_fisheye, fisheye_note
 from skyquilt.model.camera import ADJUSTABLE, PARAMETERS, Camera
@@ -40,10 +40,6 @@ LOOKED_BACK = 300
 """Photos of a camera by which it is told whether positions are rounded or repeat the one before."""
 COARSE = "coarse positions"
 """Name in the ledger of the number of photos that a note named last for that."""
-STAND_IN = "EPSG:3857"
-"""The projection in which the page draws a map without a place, about its origin, where its metres
-are those of the map. Nothing else is told of it as if the map were there.
-"""
 ON_MAP = ("placed", "refined")
 """States of photos that are drawn."""
 

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from skyquilt.errors import SideFileError, UsageError
-from skyquilt.live.ledger import NAME, Ledger, footprint_from
-from skyquilt.live.members import STAND_IN
+from skyquilt.live.ledger import NAME, STAND_IN, Ledger, footprint_from
 from skyquilt.outside import real
 from skyquilt.raster.map_source import FileSource, MapSource, TileSource
 from skyquilt.raster.tile_store import TileStore
