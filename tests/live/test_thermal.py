@@ -1,6 +1,8 @@
 """A thermal camera beside a visible one: two layers over one ground."""
 
 import io
+import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,12 +12,14 @@ from PIL import Image
 
 from skyquilt.live.ledger import Ledger
 from skyquilt.live.settings import LiveSettings
+from skyquilt.live.thermal_notes import ThermalNotes
 from skyquilt.live.tile_drawing import layer_of
 from skyquilt.raster.map_source import TileSource
 from skyquilt.raster.tile_store import TileStore
 from skyquilt.server.survey import LiveSurvey
 from tests.live.conftest import served
 from tests.live.test_http import middle, tile_of
+from tests.ortho.test_palettes import frames, photo
 
 
 @pytest.mark.slow
@@ -90,3 +94,30 @@ def test_no_layer_joins_degrees_counts_and_colours(band, unit, layer, tmp_path):
     for name in (layer, f"{layer}-newest"):
         assert survey.unit(name) == {"celsius": "°C", "counts": "counts"}.get(unit, "")
         assert survey.styles()[name].measured == bool(unit)
+
+
+def test_palettes_and_units_are_told_once_each(tmp_path):
+    """With the sentences of whole flights, as photos come one by one, and not again after a
+    restart.
+    """
+    small = frames(["iron"] * 8 + ["rainbow"] * 4)
+    known = [replace(photo(), name=f"{k:02d}.jpg", dtype="uint8") for k in range(12)]
+    counts = [replace(known[0], name=f"{k}.tif", dtype="uint16", unit="counts") for k in range(3)]
+    ledger = Ledger(tmp_path, write=True)
+    members = SimpleNamespace(by_id={}, ledger=ledger)
+    links = SimpleNamespace(members=members, thumbnail=small.__getitem__)
+    notes = ThermalNotes(links)
+    for k, one in enumerate([*known, *[replace(p, stored="counts") for p in counts]]):
+        if k == 10:
+            notes = ThermalNotes(links)
+        member = SimpleNamespace(id=k, photo=one, tried=k + 1, state="refined")
+        members.by_id[k] = member
+        notes.look(member)
+    told = [json.loads(b)["text"] for (b,) in ledger.rows("select body from event")]
+    ledger.close()
+    assert len(told) == 3, told
+    assert "So far: 2 thermal photos hold a palette's colours" in told[0]
+    assert "2 different palettes" in told[1]
+    assert "Thermal TIFFs are read as counts" in told[2]
+    visible = SimpleNamespace(id=99, photo=photo("visible"), tried=1, state="refined")
+    notes.look(visible)  # nothing to tell, and the ledger is closed
