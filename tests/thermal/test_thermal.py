@@ -104,6 +104,19 @@ def test_values_are_resampled_only(maps, tmp_path):
     assert np.nanmedian(values) == pytest.approx(np.median(original), abs=0.3)
 
 
+def test_maps_that_state_too_large_an_error_are_not_joined(maps, tmp_path, monkeypatch):
+    """This registration states 0.0002 to 0.0005 of the diagonal of 537 px."""
+    a, b = maps
+    folders = (tmp_path / "no", tmp_path / "no")
+    monkeypatch.setattr("skyquilt.thermal.routes.MOST_STATED", 0.001)
+    assert join(a, b, folders, "maps").route == "maps"
+    monkeypatch.setattr("skyquilt.thermal.routes.MOST_STATED", 0.0001)
+    with pytest.raises(RefusedError, match="may lie 0 px apart elsewhere"):
+        join(a, b, folders, "maps")
+    told = join(a, b, folders, "auto")
+    assert told.route == "positions" and told.refused[0][0] == "maps"
+
+
 @pytest.mark.slow
 def test_maps_of_other_places_are_not_joined(maps, tmp_path):
     a, _ = maps

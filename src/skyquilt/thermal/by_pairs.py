@@ -45,7 +45,7 @@ _GRID = 6
 """Points per side of the grid that represents a pair's transform."""
 _LEAST_PAIRS = 3
 """Fewest pairs that must be registered, and agree."""
-_PROPAGATE = Propagate(model="similarity", least_pairs=_LEAST_PAIRS, least_share=0.5)
+_PROPAGATE = Propagate(model="similarity", least_pairs=_LEAST_PAIRS, least_share=2 / 3)
 
 
 def by_pairs(visual: Scene, thermal: Scene) -> Registration | RefusedRegistration:
