@@ -145,7 +145,7 @@ def test_pairs_show_their_heights_where_positions_err_by_two_metres(flight, tmp_
     for k in (0, 3, 6):
         *events, _ = iter_depth(photos[k : k + 2], tmp_path / "out", SETTINGS, overwrite=True)
         told.append(against_truth(tmp_path / "out", flight)[:2])
-    assert any("times that of its positions" in e.text for e in events if isinstance(e, Note))
+    assert any("rests on heights above take-off" in e.text for e in events if isinstance(e, Note))
     r, slope = np.array(told).T
     assert r.min() >= 0.9 and 0.9 <= slope.min() <= slope.max() <= 1.1, told
 
