@@ -29,6 +29,14 @@ def notes(live):
     ]
 
 
+def nothing_left_elsewhere(live, folder):
+    """The map ends some tens of metres around its photos, and these lie where they were taken."""
+    west, south, east, north = live.tiles.extent("visible", live.canvas.gsd)
+    assert max(east - west, north - south) < 300
+    for shown in LiveSurvey(folder).photos():
+        assert np.abs(np.array(shown.ring) - (14.3, 46.6)).max() < 0.01
+
+
 def moved(photo, folder, place):
     """A copy of a photo that says it was taken in another place."""
     folder.mkdir(exist_ok=True)
@@ -51,11 +59,7 @@ def test_a_map_that_began_elsewhere_is_begun_again_where_most_photos_are(
     assert sum("it is begun again around them" in text for text in notes(live)) == 1
     assert live.ledger.counts() == {"refined": 6, "refused": 0}
     assert np.abs(offsets(live, flight)).max() < 3.0
-    # nothing is left where it began: the map ends some tens of metres around its photos
-    west, south, east, north = live.tiles.extent("visible", live.canvas.gsd)
-    assert max(east - west, north - south) < 300
-    for shown in LiveSurvey(tmp_path / "out").photos():
-        assert np.abs(np.array(shown.ring) - (14.3, 46.6)).max() < 0.01
+    nothing_left_elsewhere(live, tmp_path / "out")
     live.close()
 
 

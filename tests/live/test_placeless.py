@@ -20,7 +20,7 @@ from skyquilt.simulate.settings import Route
 from tests.end_to_end.conftest import relabel
 from tests.live.conftest import fed, made, served
 from tests.live.test_crash import replay, same
-from tests.live.test_elsewhere import notes
+from tests.live.test_elsewhere import notes, nothing_left_elsewhere
 
 QUICK = LiveSettings(features=600)
 NOWHERE_FRAME = MapFrame(crs=None, origin=(0.0, 0.0), vertical_datum="unknown", metric=False)
@@ -156,10 +156,7 @@ def test_with_a_photo_that_has_a_position_it_is_begun_again_with_its_place(fligh
     assert f"{PLACED}." in notes(live)
     assert live.ledger.counts() == {"refined": 6, "refused": 0}
     assert np.abs(misfit(live, flight)).max() < 0.15
-    west, south, east, north = live.tiles.extent("visible", live.canvas.gsd)
-    assert max(east - west, north - south) < 300
-    for shown in LiveSurvey(tmp_path / "out").photos():
-        assert np.abs(np.array(shown.ring) - (14.3, 46.6)).max() < 0.01
+    nothing_left_elsewhere(live, tmp_path / "out")
     live.close()
 
 

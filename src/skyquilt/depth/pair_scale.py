@@ -10,7 +10,7 @@ by how likely they make the difference.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -74,9 +74,4 @@ def weighed(difference: float, sigma: float, lasting: float) -> PairScale:
 def scaled(alignment: Alignment, factor: float) -> Alignment:
     """The alignment with all lengths multiplied, about the middle of its cameras."""
     middle = np.mean([p.map_C for p in alignment.poses.values()], axis=0)
-    poses = {
-        i: replace(p, map_C=middle + factor * (p.map_C - middle))
-        for i, p in alignment.poses.items()
-    }
-    ties = replace(alignment.ties, xyz=middle + factor * (alignment.ties.xyz - middle))
-    return replace(alignment, poses=poses, ties=ties)
+    return alignment.carried(np.eye(3), factor, middle)

@@ -3,7 +3,6 @@ a frame of its own, at another place, turned, and of another size.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,10 +37,7 @@ def in_frame_of(done: Alignment, before: Mapping[int, Pose], ground: float) -> A
         return None
     c, s = across.real / abs(across), across.imag / abs(across)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    shift = middle_b - scale * turn @ middle_a
-    ties = replace(done.ties, xyz=scale * done.ties.xyz @ turn.T + shift)
-    poses = {i: _moved(p, scale, turn, shift) for i, p in done.poses.items()}
-    return replace(done, poses=poses, ties=ties)
+    return done.carried(turn, scale, middle_a, middle_b)
 
 
 def _seen(pose: Pose, level: float) -> Array:
@@ -49,16 +45,3 @@ def _seen(pose: Pose, level: float) -> Array:
     rays = RAYS @ pose.cam_R_map
     fall = (level - pose.map_C[2]) / np.minimum(rays[:, 2], -LEAST_DROP)
     return np.concatenate([pose.map_C[None], pose.map_C + rays * fall[:, None]])
-
-
-def _moved(pose: Pose, scale: float, turn: Array, shift: Array) -> Pose:
-    motion = pose.motion
-    if motion is not None:
-        motion = replace(motion, shift_m=scale * turn @ motion.shift_m)
-    sigma = None if pose.sigma_m is None else scale * np.abs(turn @ pose.sigma_m)
-    return Pose(
-        cam_R_map=pose.cam_R_map @ turn.T,
-        map_C=scale * turn @ pose.map_C + shift,
-        sigma_m=sigma,
-        motion=motion,
-    )

@@ -253,13 +253,17 @@ class Alignment:
         """The calibration of a photo."""
         return self.cameras[self.camera_of[photo]]
 
-    def carried(self, turn: Array, factor: float, middle: Array) -> "Alignment":
+    def carried(
+        self, turn: Array, factor: float, middle: Array, to: Array | None = None
+    ) -> "Alignment":
         """The alignment of photos placed in space without control points, turned by `turn` (3, 3)
-        and enlarged by a factor about a point (3,): photos show what they did.
+        and enlarged by a factor about a point (3,), which comes to lie at `to` (None: where it
+        was): photos show what they did.
         """
+        at = middle if to is None else to
 
         def there(places: Array) -> Array:
-            return np.asarray(middle + factor * (places - middle) @ turn.T)
+            return np.asarray(at + factor * (places - middle) @ turn.T)
 
         def pose(p: Pose) -> Pose:
             motion = p.motion
