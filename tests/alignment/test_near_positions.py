@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from skyquilt.alignment.bundle import Bundle
-from skyquilt.alignment.near_positions import told_besides
+from skyquilt.alignment.near_positions import told_besides, weighed
 from skyquilt.geometry.frames import angle_difference_deg, angles_from_cam_R_map
 from skyquilt.model.poses import Motion
 from tests.alignment.test_oblique_start import FRAME, Slanting
@@ -80,8 +80,10 @@ def test_their_headings_tell_where_north_is():
         for i, p in enumerate(survey.priors)
     ]
     assert off(survey, turned)[1] == pytest.approx(30, abs=1.5)
-    loose = np.degrees(1.5 / np.sqrt(4 * 18))  # 10 degrees by positions, 5 by headings
-    left = 30 * 25 / (25 + loose**2)
+    # 10 degrees by positions as stated, 1.4 if their errors last, 5 by headings
+    loose = np.degrees(np.array([1.5, 0.2]) / np.sqrt(4 * 18))
+    left = 30 - weighed(30.0, loose, 5.0)[0]
+    assert left == pytest.approx(30 * 25 / (25 + loose[0] ** 2), abs=0.5)  # they do not, it shows
     found = told_besides(turned, priors, 0.0)
     assert off(survey, found)[1] == pytest.approx(left, abs=1.5)
     assert sum("direction" in note for note in found.notes) == 1
@@ -125,3 +127,28 @@ def test_photos_show_the_same_after_a_map_was_turned_and_enlarged():
     back = moved.carried(turn.T, 1 / 1.7, middle)
     np.testing.assert_allclose(back.ties.xyz, found.ties.xyz, atol=1e-9)
     np.testing.assert_allclose(back.accuracy.xyz, found.accuracy.xyz, atol=1e-9)
+
+
+def test_the_weights_err_less_than_either_scale_and_than_any_fixed_weight():
+    """Drawn from what is assumed: ground of any height, receivers of both kinds."""
+    rng = np.random.default_rng(1)
+    loose, told, n = np.array([0.15, 0.02]), 0.05, 20000
+    by_positions = rng.normal(0, np.where(rng.random(n) < 0.5, *loose))
+    by_heights = rng.normal(0, told, n)
+    apart = by_heights - by_positions
+    found = [weighed(a, loose, told) for a in apart]
+    error = np.sqrt(
+        np.mean([(p + (f[0] if f else 0)) ** 2 for p, f in zip(by_positions, found, strict=True)])
+    )
+    fixed = [np.sqrt(np.mean((by_positions + w * apart) ** 2)) for w in np.linspace(0, 1, 21)]
+    assert 0.8 * min(fixed) < error < 0.95 * min(fixed)
+    stated = np.sqrt(np.mean([(loose[0] * f[1]) ** 2 for f in found if f]))
+    assert stated == pytest.approx(error, rel=0.05)  # what is left is what is told
+
+
+def test_exact_positions_keep_their_scale_and_none_leave_it_to_the_heights():
+    told = 0.06
+    assert weighed(0.1, np.array([1e-4, 1e-4]), told)[0] == pytest.approx(0, abs=1e-5)
+    assert weighed(0.2, np.array([50.0, 50.0]), told)[0] == pytest.approx(0.2, rel=1e-4)
+    assert weighed(0.0, np.array([0.1, 0.02]), told)[0] == 0
+    assert weighed(3.0, np.array([0.1, 0.02]), told) is None  # a contradiction

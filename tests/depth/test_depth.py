@@ -155,7 +155,6 @@ def test_two_photos_show_their_heights_and_their_field(flight, tmp_path):
     result = depth(photos, tmp_path / "out", SETTINGS)
     r, slope, _ = against_truth(tmp_path / "out", flight)
     assert result.metrics["route"] == "pair" and r >= 0.9 and 0.9 <= slope <= 1.1
-    assert 0.25 < result.metrics["pair_scale"]["of_height"] < 0.9
     (pair,) = json.loads((tmp_path / "out" / "depth.json").read_text())["pairs"]
     field = cv2.imread(str(tmp_path / "out" / "pairs" / pair["field"]))
     assert field.shape == (562, 750, 3) and field.std() > 5

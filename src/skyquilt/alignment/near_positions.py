@@ -1,6 +1,10 @@
 """Photos taken so near to each other, for the errors of their positions, that these hardly tell how
-large the map is and where its north lies: a hover, a panorama, a handful of photos. Heights above
-take-off and reported headings tell it besides.
+large the map is and where its north lies: a pair, a hover, a panorama, a handful of photos. Heights
+above take-off and reported headings tell it besides.
+
+Receivers whose errors last longer than such a flight tell distances far better than each position.
+Which kind a receiver is, few photos show only by how well positions agree with heights and
+headings: both kinds are weighed by how likely they make the difference.
 """
 
 from collections.abc import Sequence
@@ -9,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.geometry.frames import angles_from_cam_R_map
+from skyquilt.geometry.frames import angle_difference_deg, angles_from_cam_R_map
 from skyquilt.model.poses import Alignment, Prior
 
 LOOSE_SCALE, LOOSE_DEG = 0.05, 5.0
@@ -28,6 +32,10 @@ CONTRADICTED = 3.5
 """Heights and headings that contradict the positions by more deviations are not used: the place of
 take-off lies elsewhere, or files were turned.
 """
+GROUND = 0.4
+"""Share of the tie points that lie below the ground's height: some lie on what stands there."""
+LASTING_M = 0.2
+"""Deviation in m of a position to others of the same flight where the receiver's errors last."""
 ALIKE_DEG = 30.0
 """Reported headings are off by one angle if most are off by about as much."""
 
@@ -67,15 +75,19 @@ class _Told:
     """Deviations after the change over those before."""
 
 
-def _loose(found: Alignment, priors: Sequence[Prior], held: Sequence[int], axes: int) -> float:
-    """Deviation of what the positions tell by their first axes: with three of the scale, as a
-    share, with two of the direction, in rad.
+def _loose(
+    found: Alignment, priors: Sequence[Prior], held: Sequence[int], axes: int
+) -> NDArray[np.float64]:
+    """Deviations of what the positions tell by their first axes: with three of the scale, as a
+    share, with two of the direction, in rad; as stated, and where the receiver's errors last.
     """
     C = np.array([found.poses[i].map_C for i in held])
     sigma = np.array([priors[i].sigma_C for i in held])
     reach = C - np.average(C, axis=0, weights=sigma[:, 0] ** -2)
-    tells = float(((reach / sigma)[:, :axes] ** 2).sum())
-    return 1 / float(np.sqrt(max(tells, 1e-6)))
+    stated, lasting = (
+        float(((reach / by)[:, :axes] ** 2).sum()) for by in (sigma, np.minimum(sigma, LASTING_M))
+    )
+    return 1 / np.sqrt(np.maximum([stated, lasting], 1e-6))
 
 
 def _loose_ground(found: Alignment, held: Sequence[int]) -> float:
@@ -91,31 +103,37 @@ def _loose_ground(found: Alignment, held: Sequence[int]) -> float:
     return float(np.median(off[outer] / np.maximum(far[outer], 1e-6)))
 
 
-def _weighed(apart: float, loose: float, told: float) -> tuple[float, float] | None:
-    """The change of what has a deviation `loose` towards what lies `apart` and has the deviation
-    `told`, and the share of the deviation that is left; None where they contradict each other.
+def weighed(apart: float, loose: NDArray[np.float64], told: float) -> tuple[float, float] | None:
+    """The change of what positions tell, with the deviations `loose` (2: as stated, and where their
+    errors last), towards what lies `apart` and has the deviation `told`, and the share of the
+    stated deviation that is left; None where they contradict each other.
     """
-    if abs(apart) > CONTRADICTED * np.hypot(loose, told):
+    whole = loose**2 + told**2
+    if abs(apart) > CONTRADICTED * np.sqrt(whole[0]):
         return None
-    share = loose**2 / (loose**2 + told**2)
-    return share * apart, float(np.sqrt(1 - share))
+    likely = np.exp(-(apart**2) / (2 * whole)) / np.sqrt(whole)
+    likely /= likely.sum()
+    share = loose**2 / whole
+    change = apart * float(likely @ share)
+    left = likely @ (share * told**2 + (apart * share - change) ** 2)
+    return change, float(np.sqrt(left) / loose[0])
 
 
 def _scale(
     found: Alignment, priors: Sequence[Prior], held: Sequence[int], ground_m: float
 ) -> _Told | None:
     xyz, told = found.ties.xyz, _loose(found, priors, held, 3)
-    loose = max(told, min(_loose_ground(found, held), MOST_LOOSER * told))
+    loose = told * float(np.clip(_loose_ground(found, held) / told[0], 1, MOST_LOOSER))
     above = float(np.median([priors[i].map_C[2] for i in held])) - ground_m
-    if not len(xyz) or not above > 1 or not loose > LOOSE_SCALE:
+    if not len(xyz) or not above > 1 or not loose[0] > LOOSE_SCALE:
         return None
-    low, ground, top = np.quantile(xyz[:, 2], [0.16, 0.5, 0.84])
+    low, ground, top = np.quantile(xyz[:, 2], [0.16, GROUND, 0.84])
     high = float(np.median([found.poses[i].map_C[2] for i in held]) - ground)
     if not high > 0:
         return None
     uneven = float(np.hypot(EVEN, (top - low) / (2 * high)))
-    weighed = _weighed(above / high - 1, loose, uneven * above / high)
-    if weighed is None:
+    to = weighed(above / high - 1, loose, uneven * above / high)
+    if to is None:
         return _Told(
             f"Positions near to each other tell that the photos were taken {high:.0f} m above the"
             f" ground, but they report {above:.0f} m above take-off: the place of take-off lies"
@@ -123,36 +141,31 @@ def _scale(
         )
     return _Told(
         f"The photos were taken so near to each other that their positions tell the map's scale to"
-        f" {min(100 * loose, 100):.0f} % only. So it rests on heights above take-off, too, which"
+        f" {min(100 * loose[0], 100):.0f} % only. So it rests on heights above take-off, too, which"
         " tell it where the ground is as high as the place of take-off. Control points would"
         " settle it.",
-        *weighed,
+        *to,
     )
 
 
 def _heading(found: Alignment, priors: Sequence[Prior], held: Sequence[int]) -> _Told | None:
     told = [i for i in held if np.isfinite(priors[i].yaw_deg)]
-    loose = float(np.degrees(_loose(found, priors, held, 2)))
-    if not loose > LOOSE_DEG or 2 * len(told) < len(held) or not told:
+    loose = np.degrees(_loose(found, priors, held, 2))
+    if not loose[0] > LOOSE_DEG or 2 * len(told) < len(held) or not told:
         return None
     grid = [angles_from_cam_R_map(found.poses[i].cam_R_map)[0] for i in told]
     off = np.array([priors[i].yaw_deg for i in told]) - grid
-    apart = np.abs(_wrapped(off[:, None] - off))
+    apart = np.abs(angle_difference_deg(off[:, None], off))
     usual = off[np.argmin(apart.sum(1))]  # files that were turned have another one
-    alike = _wrapped(off - usual)
+    alike = angle_difference_deg(off, usual)
     if 2 * (np.abs(alike) < ALIKE_DEG).sum() <= len(alike):
         return None
-    by = float(_wrapped(usual + np.median(alike[np.abs(alike) < ALIKE_DEG])))
-    weighed = _weighed(by, loose, float(np.median([priors[i].sigma_yaw_deg for i in told])))
-    if weighed is None:
+    by = angle_difference_deg(usual, -float(np.median(alike[np.abs(alike) < ALIKE_DEG])))
+    to = weighed(by, loose, float(np.median([priors[i].sigma_yaw_deg for i in told])))
+    if to is None:
         return None  # told for each photo (`alignment.conflicts`)
     return _Told(
         f"The photos were taken so near to each other that their positions tell the map's"
-        f" direction to {min(loose, 180):.0f} degrees only. So it rests on their headings, too.",
-        float(np.radians(weighed[0])),
+        f" direction to {min(loose[0], 180):.0f} degrees only. So it rests on their headings, too.",
+        float(np.radians(to[0])),
     )
-
-
-def _wrapped(degrees: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Angles between -180 and 180 degrees."""
-    return np.asarray((degrees + 180) % 360 - 180)

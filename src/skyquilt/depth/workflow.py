@@ -7,8 +7,7 @@
                      photos it is the thesis's way for a pair
     reconstruction   the heights of the whole adjustment, projected on the plane (5.8)
 
-The photos are placed as by `mosaic`, so depth.tif fits the map; but for the scale of two photos
-alone, of which their positions tell little (`pair_scale`).
+The photos are placed as by `mosaic`, so depth.tif fits the map.
 """
 
 import json
@@ -33,7 +32,6 @@ from skyquilt.depth.files import (
     write_png,
 )
 from skyquilt.depth.page import depth_page
-from skyquilt.depth.pair_scale import PairScale, pair_scale, scaled
 from skyquilt.depth.pairs import NoField, OnePlane, PairField, pair_field
 from skyquilt.engine.clock import Clock, Steps
 from skyquilt.engine.folder import STATE, claimed
@@ -47,7 +45,7 @@ from skyquilt.settings import MosaicSettings, within
 from skyquilt.typed import as_path, instance
 from skyquilt.version import __version__
 from skyquilt.workflows.artefacts import REGISTRY
-from skyquilt.workflows.flow import Scene, align_photos, find_ground, frames_added, scene_of
+from skyquilt.workflows.flow import Scene, frames_added, scene_of
 from skyquilt.workflows.methods import Methods, methods_for
 from skyquilt.workflows.survey_input import SurveyInput, read_input
 
@@ -55,8 +53,6 @@ FEATURE_PX = 640
 """Longest side in px of the images searched for features. Their disparities form the map, so many
 features are needed.
 """
-TOLD = 0.01
-"""Change of a pair's scale from which the user is told."""
 ROUTES = ("auto", "pair", "disparities", "reconstruction")
 """`auto` is `pair` for two photos and `reconstruction` for more."""
 
@@ -73,8 +69,6 @@ class Depth:
     """Pairs used; empty for the reconstruction."""
     without: tuple[NoField, ...] = ()
     """Linked pairs that determine no heights."""
-    scale: PairScale | None = None
-    """How the scale of a pair was found; None where positions alone told it."""
 
 
 def iter_depth(
@@ -186,39 +180,20 @@ def _by_route(
         return scene, Depth(surface=scene.ground.surface)
     methods = replace(methods, sweep=None)
     if route == "disparities":
-        scene, scale = yield from _scene_of_pair(given, methods, settings, clock)
+        scene = yield from scene_of(given, methods, settings, clock)
         steps = _disparities(scene, methods, relief_m)
-        found = yield from clock.stage("disparities", steps, keeps=False)
-        return scene, replace(found, scale=scale)
+        return scene, (yield from clock.stage("disparities", steps, keeps=False))
     why, photos = "", given.survey.photos
     for k in range(len(photos) - 1):
         pair = replace(given, survey=replace(given.survey, photos=photos[k : k + 2]))
-        scene, scale = yield from _scene_of_pair(pair, methods, settings, clock)
+        scene = yield from scene_of(pair, methods, settings, clock)
         steps = _disparities(scene, methods, relief_m, refuse=False)
         found = yield from clock.stage("disparities", steps, keeps=False)
-        found = replace(found, scale=scale)
         if found.fields:
             steps = _dense(scene, found)
             return scene, (yield from clock.stage("dense", steps, keeps=False))
         why = why or (found.without[0].reason if found.without else "they do not match")
     raise RefusedError(f"no two photos in sequence determine a height; of the first two: {why}")
-
-
-def _scene_of_pair(
-    given: SurveyInput, methods: Methods, settings: MosaicSettings, clock: Clock
-) -> Generator[Event, None, tuple[Scene, PairScale | None]]:
-    """Placed photos and their ground; where they are two, in the scale that `pair_scale` finds."""
-    aligned = yield from align_photos(given, methods, settings, clock)
-    scale = pair_scale(aligned.alignment, aligned.photos, aligned.priors)
-    if scale:
-        if abs(scale.factor - 1) > TOLD:
-            yield Note(
-                text=f"the pair's scale is {scale.factor:.3f} times that of its positions,"
-                f" because of the height above take-off (weight {scale.share:.0%})"
-            )
-        aligned = replace(aligned, alignment=scaled(aligned.alignment, scale.factor))
-    ground = yield from find_ground(aligned, methods, settings, clock)
-    return Scene(aligned=aligned, ground=ground), scale
 
 
 def _dense(scene: Scene, features: Depth) -> Steps[Depth]:
@@ -329,8 +304,6 @@ def _record(
         "cell_m": round(depth.surface.cell, 4),
         "percentiles": {str(p): round(float(np.percentile(z, p)), 3) for p in (1, 50, 99)},
         "pairs": pairs,
-        "pair_scale": depth.scale
-        and {"factor": round(depth.scale.factor, 4), "of_height": round(depth.scale.share, 3)},
         "pairs_without": [
             {"a": photos[f.a].name, "b": photos[f.b].name, "reason": f.reason}
             for f in depth.without

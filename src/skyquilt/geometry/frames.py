@@ -7,6 +7,7 @@ visually.
 """
 
 from collections.abc import Sequence
+from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,8 +78,12 @@ def belly_from_gimbal(
     return _zyx_angles(gimbal @ quarter)
 
 
-def angle_difference_deg(a: float, b: float) -> float:
-    """a - b wrapped to [-180, 180) degrees."""
+@overload
+def angle_difference_deg(a: float, b: float) -> float: ...
+@overload
+def angle_difference_deg(a: Matrix, b: Matrix | float) -> Matrix: ...
+def angle_difference_deg(a: Matrix | float, b: Matrix | float) -> Matrix | float:
+    """a - b wrapped to [-180, 180) degrees; of arrays, each element's."""
     return (a - b + 180.0) % 360.0 - 180.0
 
 
