@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from skyquilt.model.poses import ControlResidual
-from skyquilt.quality.run_metrics import _holes, control_figures
+from skyquilt.model.poses import Accuracy, ControlResidual
+from skyquilt.model.raster import Grid
+from skyquilt.quality.run_metrics import _holes, accuracy_figures, control_figures
 
 
 @pytest.mark.parametrize(
@@ -76,3 +77,22 @@ def test_holes_against_scipy():
 def test_no_holes():
     assert _holes(np.ones((4, 4), bool), 1.0) == {"holes": 0, "holes_m2": 0.0}
     assert _holes(np.zeros((4, 4), bool), 1.0) == {"holes": 0, "holes_m2": 0.0}
+
+
+def test_the_accuracy_is_that_of_the_ground_that_the_map_shows():
+    grid = Grid(west=10.0, north=30.0, gsd=1.0, width=20, height=20)
+    seen = np.zeros((20, 20), bool)
+    seen[:, :10] = True  # eastings 10 to 20
+    told = Accuracy(
+        xyz=np.array([[12.0, 20, 0], [18.0, 12, 0], [25.0, 20, 0], [9000.0, 20, 0], [12.0, -5, 0]]),
+        sigma_m=np.array([[1.0, 1, 2], [2.0, 2, 5], [7.0, 7, 7], [9e3, 9e3, 9e3], [8.0, 8, 8]]),
+        shared_m=(1.5, 3.0),
+        focal_share=0.5,
+        design_effect=2.0,
+    )
+    found = accuracy_figures(told, seen, grid)
+    assert found["horizontal_m"] == {"median": 1.5, "worst": 2.0}
+    assert found["vertical_m"] == {"median": 3.5, "worst": 5.0}
+    nowhere = accuracy_figures(told, ~np.ones((20, 20), bool), grid)
+    assert nowhere["horizontal_m"]["worst"] == 9000  # a map without a point is told of all
+    assert accuracy_figures(None, seen, grid) is None

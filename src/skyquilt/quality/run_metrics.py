@@ -13,6 +13,7 @@ from skyquilt.model.event import MetadataConflict
 from skyquilt.model.features import Link, RejectedLink
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.poses import Accuracy, Alignment, Prior
+from skyquilt.model.raster import Grid
 from skyquilt.ortho.companions import Drawn
 from skyquilt.ortho.ground import Ground
 from skyquilt.quality.geolocation import gps_residuals
@@ -133,14 +134,22 @@ def shutter_figures(photos: Sequence[Photo], alignment: Alignment) -> dict[str, 
     return out
 
 
-def accuracy_figures(accuracy: Accuracy | None) -> dict[str, Any] | None:
+def accuracy_figures(
+    accuracy: Accuracy | None, seen: NDArray[np.bool_], grid: Grid
+) -> dict[str, Any] | None:
     """Predicted deviations of the map's ground points in m, in the median and at the worst place;
     what the positions' common error adds is given apart.
+
+    Points count where the map is drawn (`seen`, on `grid`): those near a horizon in the picture
+    may be off by kilometres, and are in no map.
     """
     if accuracy is None or not len(accuracy.sigma_m):
         return None
-    flat = np.sqrt((accuracy.sigma_m[:, :2] ** 2).mean(1))
-    up = accuracy.sigma_m[:, 2]
+    column, row = (np.rint(at) for at in grid.pixel(accuracy.xyz[:, 0], accuracy.xyz[:, 1]))
+    inside = (column >= 0) & (column < grid.width) & (row >= 0) & (row < grid.height)
+    inside[inside] = seen[row[inside].astype(int), column[inside].astype(int)]
+    sigma = accuracy.sigma_m[inside] if inside.any() else accuracy.sigma_m
+    flat, up = np.sqrt((sigma[:, :2] ** 2).mean(1)), sigma[:, 2]
     return {
         "horizontal_m": {"median": _round(np.median(flat), 4), "worst": _round(flat.max(), 4)},
         "vertical_m": {"median": _round(np.median(up), 4), "worst": _round(up.max(), 4)},
@@ -195,7 +204,7 @@ def figures(
         "warnings": list(warnings),
         "cameras": camera_figures(photos, alignment),
         "shutter": shutter_figures(photos, alignment),
-        "accuracy": accuracy_figures(alignment.accuracy),
+        "accuracy": accuracy_figures(alignment.accuracy, seen, drawn.views_grid),
         "notes": list(notes),
     }
 
