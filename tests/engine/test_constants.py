@@ -143,7 +143,7 @@ KEYS = {
         ("pictures", "PICTURE"),
         ("links", "DESCRIPTOR_UNIT"),
         ("alignment", "INDEPENDENT"),
-        ("alignment", "YAW_LIE_DEG"),
+        ("alignment", "GROSS_DEG"),
         ("alignment", "MOST_PAIRS"),
         ("alignment", "NOMINAL_HEIGHT_M"),
         ("alignment", "HALF_TURN"),

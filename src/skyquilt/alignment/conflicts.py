@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from skyquilt.alignment.headings import GROSS_DEG, common_error_deg
 from skyquilt.geometry.camera import distort
 from skyquilt.geometry.frames import angle_difference_deg, angles_from_cam_R_map
 from skyquilt.model.camera import Camera
@@ -24,7 +25,7 @@ def conflicts(
 ) -> list[MetadataConflict]:
     """All contradictions of photos that are connected by tie points, in order of capture."""
     held = alignment.held or (tuple(sorted(alignment.poses)) if alignment.method == "pose" else ())
-    found = [c for i in held for c in _yaw(photos[i], priors[i], alignment, i)]
+    found = _yaws(photos, priors, alignment, held)
     if alignment.frame.crs is not None:
         found += _altitudes(photos, priors, alignment, held) + _positions(
             photos, priors, alignment, held
@@ -50,19 +51,46 @@ def _unusable(photos: Sequence[Photo], alignment: Alignment) -> list[MetadataCon
     return list(out.values())
 
 
-def _yaw(photo: Photo, prior: Prior, alignment: Alignment, i: int) -> list[MetadataConflict]:
-    if not np.isfinite(prior.yaw_deg):
-        return []
-    grid_yaw, _, _ = angles_from_cam_R_map(alignment.poses[i].cam_R_map)
-    off = angle_difference_deg(prior.yaw_deg, grid_yaw)
-    if abs(off) < max(YAW_DEG, 3 * prior.sigma_yaw_deg):
+def _yaws(
+    photos: Sequence[Photo], priors: Sequence[Prior], alignment: Alignment, held: Sequence[int]
+) -> list[MetadataConflict]:
+    """Headings that are off; what those of one camera are off in common is no file's turn."""
+    off = {
+        i: angle_difference_deg(
+            priors[i].yaw_deg, angles_from_cam_R_map(alignment.poses[i].cam_R_map)[0]
+        )
+        for i in held
+        if np.isfinite(priors[i].yaw_deg)
+    }
+    cameras: dict[str, list[int]] = {}
+    for i in off:
+        cameras.setdefault(photos[i].camera_key, []).append(i)
+    common = {
+        key: common_error_deg(
+            np.array([off[i] for i in own]), [photos[i].editor is None for i in own]
+        )
+        for key, own in cameras.items()
+    }
+    return [
+        c
+        for i in off
+        for c in _yaw(photos[i], priors[i], alignment, off[i], common[photos[i].camera_key])
+    ]
+
+
+def _yaw(
+    photo: Photo, prior: Prior, alignment: Alignment, off: float, common: float
+) -> list[MetadataConflict]:
+    own = angle_difference_deg(off, common)
+    turned = abs(abs(own) - 180) < GROSS_DEG and photo.editor is not None
+    if abs(off) < max(YAW_DEG, 3 * prior.sigma_yaw_deg) and not turned:
         return []
     convergence = alignment.frame.convergence_deg
     why = (
         f"the reported heading ({prior.yaw_source}) is wrong by {off:+.0f} degrees: a compass or"
         " gimbal that was not calibrated"
     )
-    if abs(abs(off) - 180) < 20 and photo.editor:
+    if turned:
         why = "another program has turned the file upside down, not its metadata"
     elif abs(abs(off) - 90) < 20 and photo.height > photo.width:
         why = "the file was turned upright, by a quarter, and its metadata were not"
@@ -71,7 +99,7 @@ def _yaw(photo: Photo, prior: Prior, alignment: Alignment, i: int) -> list[Metad
             photo=photo.name,
             field="yaw",
             reported=round(angle_difference_deg(prior.yaw_deg + convergence, 0), 1),
-            estimated=round(angle_difference_deg(grid_yaw + convergence, 0), 1),
+            estimated=round(angle_difference_deg(prior.yaw_deg - off + convergence, 0), 1),
             meaning=why,
         )
     ]

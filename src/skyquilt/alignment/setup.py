@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.headings import GROSS_DEG, steered
 from skyquilt.alignment.motion import velocities
 from skyquilt.alignment.problem import PART, READOUT, Problem, State
 from skyquilt.alignment.start import Start
@@ -34,8 +35,6 @@ TOGETHER = 500_000
 """Observations, about, of the parts in which those of all tracks are computed."""
 FISHEYE = PARAMETERS.index("fisheye")
 """Column of the kind of lens among the intrinsics."""
-YAW_LIE_DEG = 20.0
-"""A reported yaw further than this, in degrees, from that of the links is a gross error."""
 UNKNOWN_HEIGHT = 0.5
 """Deviation of heights that are not known, as a share of that of the start, which takes the ground
 for level: on a mountain side it tilts photos that weigh it more than their own tilts.
@@ -189,10 +188,12 @@ def set_up(
     a = np.array([start.placed[m][0] for m in members.tolist()])
     t = np.array([start.placed[m][1] for m in members.tolist()])
     yaw = -np.degrees(np.angle(a))
+    if repair and not start.in_space:
+        priors = steered(photos, priors, start, dict(zip(members.tolist(), yaw, strict=True)))
     lies = np.array([_yaw_lie(priors[m], y) for m, y in zip(members.tolist(), yaw, strict=True)])
     turned = np.zeros(len(photos), bool)
     for m, lie in zip(members.tolist(), lies, strict=True):
-        turned[m] = abs(abs(lie) - 180) < YAW_LIE_DEG and photos[m].editor is not None
+        turned[m] = abs(abs(lie) - 180) < GROSS_DEG and photos[m].editor is not None
     keys = tuple(dict.fromkeys(photos[m].camera_key for m in members.tolist()))
     camera = np.array([keys.index(photos[m].camera_key) for m in members.tolist()])
     first = [next(m for m in members.tolist() if photos[m].camera_key == key) for key in keys]
@@ -312,7 +313,7 @@ def _attitudes(
     R0, sigma = [], []
     for m, y, lie in zip(members.tolist(), yaw, lies, strict=True):
         prior = priors[m]
-        false = repair and abs(lie) > YAW_LIE_DEG
+        false = repair and abs(lie) > GROSS_DEG
         trusted = np.isfinite(prior.yaw_deg) and not false
         if trusted or turned[m]:
             R0.append(cam_R_map_from_angles(prior.yaw_deg, prior.pitch_deg, prior.roll_deg))
