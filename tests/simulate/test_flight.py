@@ -89,6 +89,12 @@ def test_position_noise(correlation):
     )
 
 
+def sight(yaw, pitch):
+    """The direction in which a gimbal of these angles in degrees looks."""
+    y, p = np.radians([yaw, pitch])
+    return np.array([np.cos(p) * np.sin(y), np.cos(p) * np.cos(y), np.sin(p)])
+
+
 def test_lies():
     flown = shots(Route(photos=40))
     place = place_at(46.6, 14.3)
@@ -105,6 +111,14 @@ def test_lies():
     drift = report_all(flown, replace(noise, altitude_drift=100.0), place, START, LENS, 7)
     assert drift[-1].sea_level - honest[-1].sea_level == pytest.approx(100, abs=0.01)
     assert drift[0].lies == ("altitude",)
+    off = report_all(flown, replace(noise, compass_error=-20.0), place, START, LENS, 7)
+    tipped = report_all(flown, replace(noise, gimbal_error=2.5), place, START, LENS, 7)
+    for a, b, c in zip(honest, off, tipped, strict=True):
+        for before, after in ((a.flight_yaw, b.flight_yaw), (a.gimbal[0], b.gimbal[0])):
+            assert (after - before + 180) % 360 - 180 == pytest.approx(-20, abs=0.02)
+        assert (b.lies, c.lies) == (("yaw",), ())
+        looks = [sight(*r.gimbal[:2]) for r in (a, c)]
+        assert np.degrees(np.arccos(looks[0] @ looks[1])) == pytest.approx(2.5, abs=0.05)
     silent = report_all(
         flown, replace(noise, gps_missing=4, focal_missing=True), place, START, LENS, 7
     )
@@ -157,6 +171,8 @@ def test_every_number_must_be_one(settings, value):
         ("reporting", {"gps_noise": 1e9}),
         ("reporting", {"gps_noise_z": -1.0}),
         ("reporting", {"altitude_drift": -1e9}),
+        ("reporting", {"compass_error": 181.0}),
+        ("reporting", {"gimbal_error": -31.0}),
         ("reporting", {"focal_error": 1e9}),
         ("pictures", {"exposure_noise": 1e9}),
     ],

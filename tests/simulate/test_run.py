@@ -151,6 +151,7 @@ def test_a_used_folder_is_refused(survey, tmp_path):
 def test_command_with_every_option(tmp_path):
     words = """--preset demo --photos 6 --overlap 70 --sidelap 50 --height 70 --heading 75
     --size 240x180 --gps-noise 1 --gps-missing 1 --yaw-lie tag --altitude-drift 20 --focal-error 2
+    --compass-error 12 --gimbal-error -1
     --tilt-noise 0.5 --relief 3 --season winter --hour 12 --exposure-noise 0.1 --motion-blur 2
     --vignetting 30 --sun-hours 1
     --no-thermal --drones 2 --lose 1 --gcp 2 --checks 1 --seed 4"""

@@ -81,6 +81,12 @@ def command(
         Literal["none", "turned", "tag"] | None,
         typer.Option(help="middle line: files turned by 180 degrees, or only the tag wrong"),
     ] = None,
+    compass_error: Annotated[
+        float | None, typer.Option(help="of all headings alike, degrees")
+    ] = None,
+    gimbal_error: Annotated[
+        float | None, typer.Option(help="of all pitch angles alike, degrees")
+    ] = None,
     altitude_drift: Annotated[
         float | None, typer.Option(help="error of reported heights at the end, m")
     ] = None,
@@ -197,6 +203,8 @@ def command(
         rtk=rtk or None,
         gps_missing=gps_missing,
         yaw_lie=yaw_lie,
+        compass_error=compass_error,
+        gimbal_error=gimbal_error,
         altitude_drift=altitude_drift,
         focal_error=_share(focal_error),
     )

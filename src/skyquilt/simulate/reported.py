@@ -184,10 +184,12 @@ def _report(
     barometer = rng.normal(0, settings.barometer_noise)
     lie = 180.0 if lying and settings.yaw_lie == "tag" else 0.0
     north = place.convergence
-    gimbal = gimbal_angles(angles[0] + north + lie, angles[1], angles[2])
+    compass = north + lie + settings.compass_error
+    gimbal = gimbal_angles(angles[0] + compass, angles[1] + settings.gimbal_error, angles[2])
     offsets = settings.clock_offsets or (0.0,)
     altitude_lie = abs(settings.altitude_drift) > 3
-    lies = ["yaw"] * lying + ["altitude"] * altitude_lie
+    turned = lying or abs(settings.compass_error) > 15
+    lies = ["yaw"] * turned + ["altitude"] * altitude_lie
     with_angles = not settings.attitude_missing
     return Report(
         latitude=None if silent else round(latitude, 9),
@@ -197,9 +199,7 @@ def _report(
         gimbal=(round(gimbal[0], 2), round(gimbal[1], 2), round(gimbal[2], 2))
         if with_angles
         else None,
-        flight_yaw=round(wrap(shot.waypoint.heading + north + lie + nose), 2)
-        if with_angles
-        else None,
+        flight_yaw=round(wrap(shot.waypoint.heading + compass + nose), 2) if with_angles else None,
         clock=round(shot.waypoint.time + offsets[shot.waypoint.drone % len(offsets)], 3),
         focal=None if settings.focal_missing else lens.focal * (1 + settings.focal_error),
         velocity=_ned(shot, north) if with_angles else None,

@@ -121,6 +121,10 @@ class Reporting:
     """Error of all reported heights that grows linearly to this value over the flight, m."""
     angle_noise: float = 0.5
     """Standard deviation of each reported angle, degrees."""
+    compass_error: float = 0.0
+    """Error that all reported headings have in common, degrees clockwise."""
+    gimbal_error: float = 0.0
+    """Error that all reported pitch angles have in common, degrees upwards."""
     yaw_lie: YawLie = "none"
     """Error of one whole line: files rotated by 180 degrees in a viewer, or only the yaw tag wrong
     by 180 degrees.
@@ -356,6 +360,14 @@ def _other_rules(settings: FlightSettings) -> _Rules:
         (
             abs(reporting.altitude_drift) <= MOST_M,
             f"altitude drift must be at most {MOST_M:g} m, not {reporting.altitude_drift:g}",
+        ),
+        (
+            abs(reporting.compass_error) <= 180,
+            f"compass error must be -180 to 180 degrees, not {reporting.compass_error:g}",
+        ),
+        (
+            abs(reporting.gimbal_error) <= 30,
+            f"gimbal error must be -30 to 30 degrees, not {reporting.gimbal_error:g}",
         ),
         (reporting.gps_missing >= 0, "the number of photos without position must not be negative"),
         (
