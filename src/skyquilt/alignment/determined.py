@@ -35,6 +35,12 @@ FEWEST_PLACED, EXTENDED, AGREEING = 5, 6.0, 2.5
 positions' deviations they extend over at least; and by how many (median) they lie off at most,
 where the rest lies.
 """
+AGAINST, OF_USUAL = 30, 0.4
+"""Tie points that are believed against a position that lies elsewhere; or this share of what photos
+of the block usually have. Fewer are wrong matches between rows of trees or panels that look alike.
+"""
+ELSEWHERE, ELSEWHERE_HIGH = 6.0, 0.15
+"""A position lies elsewhere from so many deviations, and this share of the flying height, on."""
 AGAIN = 1.2
 """A photo is looked at again when it has this many times as many points as before."""
 GRID = np.stack(np.meshgrid(*2 * [np.linspace(0.02, 0.98, 5)]), -1).reshape(-1, 2)
@@ -55,8 +61,34 @@ def weak_photos(alignment: Alignment, priors: Sequence[Prior]) -> dict[int, str]
     found: dict[int, str] = {}
     for block in alignment.blocks:
         if len(block) > 1:
-            found |= _left_out(alignment, block, priors)
+            left = _left_out(alignment, block, priors)
+            found |= left | _elsewhere(alignment, [i for i in block if i not in left], priors)
     return found
+
+
+def _elsewhere(
+    alignment: Alignment, block: Sequence[int], priors: Sequence[Prior]
+) -> dict[int, str]:
+    """Photos of a block that few tie points place elsewhere than their positions, with reasons; the
+    others of the block agree with theirs.
+    """
+    own = [i for i in block if np.isfinite(priors[i].map_C[:2]).all()]
+    if len(own) < FEWEST_PLACED or alignment.frame.crs is None:
+        return {}
+    off = np.array([(alignment.poses[i].map_C - priors[i].map_C)[:2] for i in own])
+    away = np.linalg.norm(off - np.median(off, axis=0), axis=1)
+    sigma = np.maximum([priors[i].sigma_C[0] for i in own], np.median(away))
+    ties = alignment.ties
+    ground = float(np.median(ties.xyz[:, 2])) if len(ties.xyz) else 0.0
+    high = np.array([alignment.poses[i].map_C[2] - ground for i in own])
+    count = np.array([len(rows) for rows in map(ties.of_photos(block).__getitem__, own)])
+    few = count < min(AGAINST, OF_USUAL * float(np.median(count)))
+    elsewhere = few & (away > ELSEWHERE * sigma) & (away > ELSEWHERE_HIGH * high)
+    return {
+        own[k]: f"it has only {count[k]} tie points, by which it would lie {away[k]:.0f} m from its"
+        " reported position: matches of places that look alike"
+        for k in np.flatnonzero(elsewhere)
+    }
 
 
 def _left_out(

@@ -101,13 +101,21 @@ def without_photos(alignment: Alignment, gone: Mapping[int, str]) -> Alignment:
     """The alignment without some photos and their observations; `gone`: why each is left out."""
     if not gone:
         return alignment
+    ties, told = without(alignment.ties, gone), alignment.accuracy
+    if told is not None and len(alignment.ties.xyz):  # of the ground that others show
+        before = alignment.ties
+        others = before.point[~np.isin(before.photo, list(gone))]
+        _, at = nearest(before.xyz[:, :2], told.xyz[:, :2], 1)
+        stays = (np.bincount(others, minlength=len(before.xyz)) >= 2)[at[:, 0]]
+        told = replace(told, xyz=told.xyz[stays], sigma_m=told.sigma_m[stays])
     return replace(
         alignment,
         poses={i: p for i, p in alignment.poses.items() if i not in gone},
         blocks=tuple(
             b for old in alignment.blocks if (b := tuple(i for i in old if i not in gone))
         ),
-        ties=without(alignment.ties, gone),
+        ties=ties,
+        accuracy=told,
         rejected={**alignment.rejected, **gone},
     )
 

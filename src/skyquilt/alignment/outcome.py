@@ -115,14 +115,20 @@ def _ground_part(everything: Problem, state: State, setup: Setup) -> tuple[TiePo
 
 
 def accuracy(setup: Setup, problem: Problem, state: State, covariance: Covariance) -> Accuracy:
-    """Predicted deviations of a sample of ground points."""
+    """Predicted deviations of a sample of ground points; of those that rays tell within the flying
+    height, if there are any: others lie near a horizon, or in photos that nothing holds.
+    """
     seen = np.flatnonzero(np.bincount(problem.point, minlength=len(state.X)) >= 2)
     sample = seen[:: max(1, len(seen) // SAMPLED)]
+    sigma = point_deviations(problem, state, covariance, sample)
+    told = sigma.max(1, initial=0.0) < float(np.median(heights_above(state)))
+    if told.any():
+        sample, sigma = sample[told], sigma[told]
     tied = bool(np.isfinite(problem.X0).any())
     stated = np.median(setup.stated_sigma_C, axis=0)
     return Accuracy(
         xyz=state.X[sample],
-        sigma_m=point_deviations(problem, state, covariance, sample),
+        sigma_m=sigma,
         shared_m=(0.0, 0.0) if tied else (float(stated[0]), float(stated[2])),
         focal_share=_focal_share(problem, covariance),
         design_effect=problem.design_effect,

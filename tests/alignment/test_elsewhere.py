@@ -1,0 +1,97 @@
+"""A photo that few tie points place far from its position was matched with what looks alike."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from skyquilt.alignment import outcome
+from skyquilt.alignment.determined import weak_photos
+from skyquilt.alignment.oblique import without_photos
+from tests.alignment.test_bundle import Flown
+
+OFF = np.array([24.0, -18.0, 0.0])
+PHOTO = 7
+
+
+@pytest.fixture(scope="module")
+def block():
+    flown = Flown(3, gps=1.5)
+    return flown, flown.aligned()
+
+
+def moved(flown, found, number, *, by=OFF, all_of_them=False):
+    """The block with a photo that lies elsewhere by the tie points that it keeps."""
+    ties = found.ties
+    own = np.flatnonzero(ties.photo == PHOTO)
+    keep = np.ones(len(ties.photo), bool)
+    keep[own[number:]] = False
+    ties = replace(
+        ties,
+        point=ties.point[keep],
+        photo=ties.photo[keep],
+        px=ties.px[keep],
+        residual_px=ties.residual_px[keep],
+    )
+    priors = [
+        replace(p, map_C=p.map_C + by) if all_of_them or i == PHOTO else p
+        for i, p in enumerate(flown.priors)
+    ]
+    return replace(found, ties=ties), priors
+
+
+@pytest.mark.parametrize("number", [12, 20])
+def test_a_photo_that_few_points_place_elsewhere_is_left_out(block, number):
+    found, priors = moved(*block, number)
+    weak = weak_photos(found, priors)
+    assert set(weak) == {PHOTO}
+    assert f"only {number} tie points" in weak[PHOTO] and " 30 m from its reported" in weak[PHOTO]
+
+
+def test_many_points_are_believed_against_a_position(block):
+    found, priors = moved(*block, 150)
+    assert not weak_photos(found, priors)
+
+
+def test_few_points_are_believed_where_they_agree_with_the_position(block):
+    found, priors = moved(*block, 20, by=0 * OFF)
+    assert not weak_photos(found, priors)
+    found, priors = moved(*block, 20, by=OFF / 10)  # 3 m: two deviations
+    assert not weak_photos(found, priors)
+    found, priors = moved(*block, 20, all_of_them=True)  # the block lies elsewhere, not the photo
+    assert not weak_photos(found, priors)
+
+
+def test_the_accuracy_is_that_of_the_ground_that_other_photos_show(block):
+    _, found = block
+    gone = {0: "", 1: "", 2: ""}
+    left = without_photos(found, gone)
+    told, before = left.accuracy, found.accuracy
+    assert 0 < len(told.xyz) < len(before.xyz)
+    seen = {i: p for i, p in found.poses.items() if i not in gone}
+    for place in told.xyz:
+        shown = 0
+        for i, pose in seen.items():
+            x, y, z = pose.to_camera(place[None])[0]
+            camera = found.camera(i)
+            shown += abs(x / z * camera.focal) < camera.width and abs(y / z) * camera.focal < 600
+        assert shown >= 2
+    assert without_photos(found, {}) is found
+
+
+def test_points_that_nothing_determines_tell_nothing_of_the_ground(monkeypatch):
+    """Of every tenth point the deviation is that of no information."""
+    plain = Flown(3).aligned().accuracy
+    told = outcome.point_deviations
+
+    def lost(*given):
+        sigma = told(*given).copy()
+        sigma[::10] = 31622.8
+        return sigma
+
+    monkeypatch.setattr(outcome, "point_deviations", lost)
+    found = Flown(3).aligned().accuracy
+    assert len(found.xyz) == len(plain.xyz) - len(plain.xyz[::10])
+    assert found.sigma_m.max() <= plain.sigma_m.max() and found.sigma_m.max() < 5
+    monkeypatch.setattr(outcome, "point_deviations", lambda *g: np.full_like(told(*g), 31622.8))
+    assert Flown(3).aligned().accuracy.sigma_m.min() > 31622  # all that is known
