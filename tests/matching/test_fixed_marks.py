@@ -9,7 +9,7 @@ import pytest
 from skyquilt.matching.fixed_marks import FindFixedMarks, FixedMarks
 from skyquilt.matching.sift import Sift
 from skyquilt.matching.verify import Verify
-from skyquilt.model.features import Link
+from skyquilt.model.features import Features, Link
 from skyquilt.settings import MosaicSettings
 from skyquilt.workflows.links import link_pair, marked_in
 from skyquilt.workflows.methods import methods_for
@@ -148,3 +148,40 @@ def test_photos_of_different_ground_are_linked_by_their_text_unless_it_is_known(
 
     assert linked(FixedMarks()) >= 2
     assert linked(marks) == 0
+
+
+def keypoints(px, descriptors):
+    return Features(
+        px=np.asarray(px, float),
+        size=np.ones(len(px), np.float32),
+        descriptors=np.asarray(descriptors, np.uint8),
+        scale=1.0,
+    )
+
+
+def found_in(photos):
+    return FindFixedMarks()(photos, ["cam"] * len(photos), [(WIDE, HIGH)] * len(photos)).masks
+
+
+@pytest.mark.parametrize(("places", "found"), [(1, False), (2, False), (3, True), (9, True)])
+def test_keypoints_of_several_directions_at_one_place_count_once(places, found):
+    """As plants in rows have them, of which some lie on one another in any two pictures."""
+    rng = np.random.default_rng(places)
+    at = rng.uniform(40, 300, (places, 2)).repeat(4, axis=0)
+    alike = rng.integers(0, 200, (len(at), 128))
+    photos = []
+    for _ in range(8):
+        px = np.concatenate([rng.uniform(0, (WIDE, HIGH), (300, 2)), at])
+        photos.append(keypoints(px, np.concatenate([rng.integers(0, 200, (300, 128)), alike])))
+    assert bool(found_in(photos)) == found
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_ground_that_looks_alike_everywhere_is_no_mark(seed):
+    rng = np.random.default_rng(seed)
+    plant = rng.integers(0, 200, 128)
+    photos = [
+        keypoints(rng.uniform(0, (WIDE, HIGH), (800, 2)), plant + rng.integers(0, 20, (800, 128)))
+        for _ in range(8)
+    ]
+    assert not found_in(photos)

@@ -131,7 +131,7 @@ class Placeless:
             gsd = asked / 100 if asked else round_gsd(3 * above / focal)
             self.initial_pose.fix(gsd, above, ground, text)
             self.members.save_cameras(dict(done.cameras))
-            self.refinement.heights(done.ties.xyz, known=True)
+            self.refinement.heights(done.ties.xyz, new, known=True)
             found = self.refinement.begun_with(new, camera_of)
         hit("map begun without a place")
         self.refinement.take_back(found)

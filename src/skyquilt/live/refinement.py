@@ -1,10 +1,11 @@
 """The second step for a photo: it is linked to its neighbours and its pose is refined."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.geometry.neighbours import nearest
 from skyquilt.live.adjustment_schedule import Schedule
 from skyquilt.live.blur import LiveBlur
 from skyquilt.live.events import MapEvents, Update
@@ -18,6 +19,10 @@ from skyquilt.model.poses import Pose
 
 LOOP = 12
 """A new link closes a loop if its photos were more than this number of links apart."""
+MOST_ASIDE, LEAST_BELOW, MOST_BELOW = 4.0, 0.1, 5.0
+"""Ground lies this far beside the nearest photo at most, and this far below it at least and at
+most, all in flying heights.
+"""
 LOST = 2
 """Number of photos without links, those that came next before or after it, with which a refined
 photo is compared.
@@ -74,7 +79,7 @@ class Refinement:
             self.ledger.put_links(links)
             self.members.save_cameras(change.cameras)
             member.tried = self._tried
-            self.heights(change.xyz, known=bool(change.cameras))
+            self.heights(change.xyz, change.moved, known=bool(change.cameras))
             self.move(change.moved, change.camera_of)
             if member.state == "refined":
                 self._learn(member, loop=far)
@@ -140,10 +145,18 @@ class Refinement:
             if member.state == "refined":
                 self.redraw.moved(member)
 
-    def heights(self, xyz: NDArray[np.float64], *, known: bool, anew: bool = False) -> None:
-        """Adds ground points (P, 3) in m to the height cells (inside a transaction); `known`: they
-        come from calibrated cameras.
+    def heights(
+        self,
+        xyz: NDArray[np.float64],
+        poses: Mapping[int, Pose],
+        *,
+        known: bool,
+        anew: bool = False,
+    ) -> None:
+        """Adds ground points (P, 3) in m of photos with these poses to the height cells (inside a
+        transaction); `known`: they come from calibrated cameras.
         """
+        xyz = on_ground(xyz, poses, self.redraw.canvas.ground)
         cells = self.local_pose.metadata.heights
         touched, z = cells.add(xyz, anew=anew)
         with self.ledger.change() as db:
@@ -197,3 +210,21 @@ class Refinement:
             self.queues.untried.append(lost)
         if member.state == "waiting":
             self.queues.lost.append(member)
+
+
+def on_ground(
+    xyz: NDArray[np.float64], poses: Mapping[int, Pose], ground: float
+) -> NDArray[np.float64]:
+    """Those of some points (P, 3) in m that can be ground under photos with these poses, over
+    ground at about this height in m; all of them where there are no poses. Rays that hardly
+    converge, of matches on a text in the pictures or towards a horizon, meet above the cameras or
+    far below and beside them.
+    """
+    if not poses or not len(xyz):
+        return xyz
+    C = np.array([pose.map_C for pose in poses.values()])
+    high = max(float(np.median(C[:, 2])) - ground, 1.0)
+    away, at = nearest(C[:, :2], xyz[:, :2], 1)
+    below = (C[at[:, 0], 2] - xyz[:, 2]) / high
+    near = (away[:, 0] < MOST_ASIDE * high) & (below > LEAST_BELOW) & (below < MOST_BELOW)
+    return np.asarray(xyz[near])

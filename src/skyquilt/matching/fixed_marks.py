@@ -16,6 +16,8 @@ from skyquilt.model.features import Features
 from skyquilt.model.photo import evenly
 
 Mask = NDArray[np.bool_]
+SHIFTS = ((23, 0), (0, 19), (-17, 14), (13, -29))
+"""Shifts (x, y) in px at which nothing but chance makes pictures alike."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -77,7 +79,11 @@ class FindFixedMarks:
     parts: int = 10
     """Parts along a side."""
     least: int = 3
-    """Fewest keypoints on marks in one photo."""
+    """Fewest places of a photo with keypoints on marks; one place may have several keypoints."""
+    chance: float = 3.0
+    """And so many times as many as others show where the picture is shifted: rows of plants or
+    panels look alike wherever one lies on another.
+    """
     cell_px: int = 4
     """Side of a cell of a mask, in px of the image that was searched for features."""
 
@@ -115,20 +121,41 @@ class FindFixedMarks:
         for a, one in enumerate(photos):
             if not any(self._stood_still(one, alike[a][b], size) for b in apart):
                 apart.append(a)
-        found = [np.zeros(len(one), bool) for one in photos]
+        fixed = self._agreed(photos, alike, apart)
+        if not fixed:
+            return [np.zeros(len(one), bool) for one in photos]
+        shifted = [self._agreed(photos, self._alike(photos, by), apart) for by in SHIFTS]
+        places = [
+            sum(_places(photos[a], mask, self.cell_px) for a, mask in some.items())
+            for some in (fixed, *shifted)
+        ]
+        if places[0] <= self.chance * np.mean(places[1:]):
+            return [np.zeros(len(one), bool) for one in photos]
+        return [fixed.get(a, np.zeros(len(one), bool)) for a, one in enumerate(photos)]
+
+    def _agreed(
+        self, photos: Sequence[Features], alike: list[list[Mask]], apart: Sequence[int]
+    ) -> dict[int, Mask]:
+        """By photo, the keypoints that enough others share; only of photos with enough of them."""
+        found = {}
         for a in apart:
-            seen = np.sum([alike[a][b] for b in apart], axis=0)
-            fixed = seen >= self.agreeing
-            if self.least <= fixed.sum() <= self.standing * len(photos[a]):
+            fixed = np.sum([alike[a][b] for b in apart], axis=0) >= self.agreeing
+            enough = _places(photos[a], fixed, self.cell_px) >= self.least
+            if enough and fixed.sum() <= self.standing * len(photos[a]):
                 found[a] = fixed
         return found
 
-    def _alike(self, photos: Sequence[Features]) -> list[list[Mask]]:
-        """Which keypoints of each photo each of the others shows at the same place."""
+    def _alike(
+        self, photos: Sequence[Features], shift: tuple[int, int] = (0, 0)
+    ) -> list[list[Mask]]:
+        """Which keypoints of each photo each of the others shows at the same place, or shifted by
+        so many px (x, y) of the image that was searched.
+        """
         rasters, described = [_raster(f) for f in photos], [f.unit for f in photos]
         found = []
         for a, one in enumerate(photos):
-            place, own = _cells(one), [np.zeros(len(one), bool) for _ in photos]
+            place = np.maximum(_cells(one) + shift, 0)
+            own = [np.zeros(len(one), bool) for _ in photos]
             for b, raster in enumerate(rasters):
                 if a == b:
                     continue
@@ -161,6 +188,11 @@ def _shares(cells: Mask, share: float) -> bool:
     """
     shown, common = cells.sum((1, 2))
     return bool(common > share * shown)
+
+
+def _places(photo: Features, some: Mask, cell_px: int) -> int:
+    """How many cells of the picture some keypoints (n,) of a photo lie in."""
+    return len(np.unique(_cells(photo)[some] // cell_px, axis=0))
 
 
 def _cells(features: Features) -> NDArray[np.int64]:

@@ -1,0 +1,43 @@
+"""Ground points of the growing map lie under its photos."""
+
+import numpy as np
+import pytest
+
+from skyquilt.live.refinement import on_ground
+from skyquilt.model.poses import Pose
+
+GROUND = 440.0
+
+
+def poses(high):
+    R = np.diag([1.0, -1.0, -1.0])
+    return {i: Pose(cam_R_map=R, map_C=np.array([20.0 * i, 0.0, GROUND + high])) for i in range(6)}
+
+
+@pytest.mark.parametrize("high", [8.0, 60.0, 300.0])
+def test_what_photos_may_show_stays(high):
+    """Hills half as high as the drone flies, valleys twice as deep, and 70 degrees aside."""
+    rng = np.random.default_rng(0)
+    xyz = np.column_stack(
+        [
+            rng.uniform(-2 * high, 100 + 2 * high, 500),
+            rng.uniform(-1.5 * high, 1.5 * high, 500),
+            GROUND + rng.uniform(-2, 0.5, 500) * high,
+        ]
+    )
+    assert np.array_equal(on_ground(xyz, poses(high), GROUND), xyz)
+
+
+def test_what_lies_above_or_beyond_the_photos_goes():
+    """A text in the pictures matches itself: its rays are parallel."""
+    good = np.array([[50.0, 10, GROUND + 5]])
+    bad = np.array([[40.0, 10, GROUND + 64], [-1300, -800, GROUND - 2000], [50, 10, GROUND - 900]])
+    found = on_ground(np.concatenate([bad, good]), poses(60.0), GROUND)
+    assert np.array_equal(found, good)
+
+
+def test_nothing_is_judged_without_photos():
+    bad = np.array([[40.0, 10, GROUND + 64]])
+    assert on_ground(bad, {}, GROUND) is bad
+    none = np.zeros((0, 3))
+    assert on_ground(none, poses(60.0), GROUND) is none
