@@ -168,7 +168,7 @@ def test_keypoints_of_several_directions_at_one_place_count_once(places, found):
     """As plants in rows have them, of which some lie on one another in any two pictures."""
     rng = np.random.default_rng(places)
     at = rng.uniform(40, 300, (places, 2)).repeat(4, axis=0)
-    alike = rng.integers(0, 200, (len(at), 128))
+    alike = rng.integers(0, 200, (places, 128)).repeat(4, axis=0)  # a plant is round
     photos = []
     for _ in range(8):
         px = np.concatenate([rng.uniform(0, (WIDE, HIGH), (300, 2)), at])
@@ -179,9 +179,12 @@ def test_keypoints_of_several_directions_at_one_place_count_once(places, found):
 @pytest.mark.parametrize("seed", range(3))
 def test_ground_that_looks_alike_everywhere_is_no_mark(seed):
     rng = np.random.default_rng(seed)
-    plant = rng.integers(0, 200, 128)
+    plant = rng.integers(0, 200, 128) + rng.integers(0, 20, (500, 128))
     photos = [
-        keypoints(rng.uniform(0, (WIDE, HIGH), (800, 2)), plant + rng.integers(0, 20, (800, 128)))
+        keypoints(
+            rng.uniform(0, (WIDE, HIGH), (800, 2)),
+            np.concatenate([plant, rng.integers(0, 200, (300, 128))]),
+        )
         for _ in range(8)
     ]
     assert not found_in(photos)

@@ -136,14 +136,16 @@ class FindFixedMarks:
     def _agreed(
         self, photos: Sequence[Features], alike: list[list[Mask]], apart: Sequence[int]
     ) -> dict[int, Mask]:
-        """By photo, the keypoints that enough others share; only of photos with enough of them."""
+        """By photo, the keypoints that enough others share; only of photos with enough of them, and
+        none if there are not as many such photos: those that share a mark all show it.
+        """
         found = {}
         for a in apart:
             fixed = np.sum([alike[a][b] for b in apart], axis=0) >= self.agreeing
             enough = _places(photos[a], fixed, self.cell_px) >= self.least
             if enough and fixed.sum() <= self.standing * len(photos[a]):
                 found[a] = fixed
-        return found
+        return found if len(found) > self.agreeing else {}
 
     def _alike(
         self, photos: Sequence[Features], shift: tuple[int, int] = (0, 0)
