@@ -13,6 +13,11 @@ from skyquilt.photos.tags import Exif, Xmp, parse_exif, parse_xmp
 SOI, EOI, SOS = 0xD8, 0xD9, 0xDA
 APP0, APP1, APP3 = 0xE0, 0xE1, 0xE3
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_UNUSUAL = frozenset({0xC3, 0xC7, 0xCB, 0xCF, 0xF7})  # coded without loss; the last is JPEG-LS
+_NOT_EIGHT_BITS = (
+    "it is a JPEG of more than 8 bits, or coded without loss, which is not read; save it as usual"
+    " JPEG, TIFF or PNG"
+)
 _BARE = frozenset({0x01, *range(0xD0, 0xD8)})  # markers without a length
 _FLIR = b"FLIR\x00"
 _EXIF = b"Exif\x00"
@@ -124,6 +129,8 @@ def read_jpeg_header(file: BinaryIO) -> JpegHeader:
         if marker == EOI:
             raise UnreadablePhotoError("it is a JPEG without an image in it")
         payload = _payload(file)
+        if marker in _UNUSUAL or (marker in _FRAMES and payload[:1] not in (b"", b"\x08")):
+            raise UnreadablePhotoError(_NOT_EIGHT_BITS)
         if marker in _FRAMES and len(payload) >= 6:
             height, width = (int.from_bytes(payload[k : k + 2], "big") for k in (1, 3))
             frame, several = (width, height, payload[5]), marker in _SEVERAL_SCANS

@@ -380,9 +380,14 @@ def _px_per_mm(exif: Exif, sensor: Sensor | None, size: tuple[int, int]) -> floa
 
 
 def _calibrated_focal(xmp: Xmp, size: tuple[int, int]) -> Camera | str | None:
-    """DJI's value in px; its optical centre is counted from the image's corner."""
-    focal = xmp.number("CalibratedFocalLength")
-    x, y = xmp.number("CalibratedOpticalCenterX"), xmp.number("CalibratedOpticalCenterY")
+    """DJI's value in px, or Skydio's structure; the optical centre is counted from the image's
+    corner.
+    """
+    focal = xmp.number("CalibratedFocalLength", "CalibratedFocalLength.X")
+    x, y = (
+        xmp.number(f"CalibratedOpticalCenter{axis}", f"CalibratedOpticalCenter.{axis}")
+        for axis in "XY"
+    )
     centre = (x, y) if x and y else (size[0] / 2, size[1] / 2)
     return _camera(size, focal, centre, None) if focal else None
 

@@ -2,6 +2,8 @@
 
 import io
 import logging
+import zlib
+from dataclasses import dataclass
 from typing import BinaryIO
 
 import numpy as np
@@ -24,8 +26,13 @@ _WIDTH, _HEIGHT, _BITS, _CODEC, _SAMPLES = 256, 257, 258, 259, 277
 _STRIPS, _TILES, _XMP_TAG = 273, 324, 700
 _CODECS = frozenset({1, 5, 7, 8, 32773, 32946, 34925, 50000})
 """None, LZW, JPEG, Deflate, PackBits, Deflate (old), LZMA, Zstandard."""
+_CFA = 32803
+"""Photometric interpretation of a colour filter array."""
 _STRANGE_COLOURS, _YCBCR, _JPEGS = frozenset({8, 9, 10, 32844, 32845}), 6, frozenset({6, 7})
 """CIELAB and its kin, logarithmic light; YCbCr, which is decoded as RGB within JPEG only."""
+MOST_PNG_TEXT = 8_000_000
+"""Most bytes of a PNG's metadata that are read."""
+_XMP_OF_JPEG = b"http://ns.adobe.com/xap/1.0/\x00"
 MOST_STRIPS = 1_000_000
 """Largest number of strips or tiles of a TIFF."""
 _MOST_PAGES = 8
@@ -81,6 +88,11 @@ def read_tiff(file: BinaryIO, most_mp: float) -> Header:
             else b""
         )
         kind = int(page.photometric)
+        if kind == _CFA:
+            raise UnreadablePhotoError(
+                "it is a raw picture (DNG), whose pixels are not colours yet; save it as JPEG or"
+                " TIFF by a program that develops raw pictures"
+            )
         if kind in _STRANGE_COLOURS or (kind == _YCBCR and int(page.compression) not in _JPEGS):
             raise UnreadablePhotoError(
                 "its colours are stored in a way that is not read (photometric interpretation"
@@ -200,8 +212,20 @@ def _stored_as(dtype: np.dtype[np.generic]) -> Dtype:
     raise UnreadablePhotoError(f"its pixels are {dtype}; integers or real numbers are needed")
 
 
-def check_png(file: BinaryIO, most_mp: float = MOST_MP) -> None:
-    """Refuses a PNG by its declared size, its number of chunks, or a missing end."""
+@dataclass(frozen=True, kw_only=True)
+class PngMetadata:
+    """What chunks of a PNG tell of the photo."""
+
+    exif: bytes
+    """The EXIF block, empty where there is none."""
+    xmp: tuple[bytes, ...]
+    """XMP packets."""
+
+
+def check_png(file: BinaryIO, most_mp: float = MOST_MP) -> PngMetadata:
+    """What its chunks tell of the photo. Refuses a PNG by its declared size, its number of chunks,
+    or a missing end.
+    """
     size = file.seek(0, io.SEEK_END)
     file.seek(8)
     head = file.read(21)
@@ -213,24 +237,71 @@ def check_png(file: BinaryIO, most_mp: float = MOST_MP) -> None:
     bytes_per_px *= 2 if head[16] == 16 else 1
     check_picture(width, height, bytes_per_px, file_bytes=size, most_mp=most_mp)
     file.seek(8)
+    exif, packets, left = b"", [], MOST_PNG_TEXT
     for _ in range(MOST_CHUNKS):
         chunk = file.read(8)
         if len(chunk) < 8:
             raise UnreadablePhotoError("it is truncated: its PNG data never end")
-        if chunk[4:] == b"IEND":
-            return
-        file.seek(int.from_bytes(chunk[:4], "big") + 4, io.SEEK_CUR)
+        length, kind = int.from_bytes(chunk[:4], "big"), chunk[4:]
+        if kind == b"IEND":
+            return PngMetadata(exif=exif, xmp=tuple(packets))
+        if kind in _TOLD and length <= left:
+            left -= length
+            name, content = _told(kind, file.read(length))
+            file.seek(4, io.SEEK_CUR)
+            if name == "exif":
+                exif = exif or content
+            elif name == "xmp":
+                packets.append(content)
+            continue
+        file.seek(length + 4, io.SEEK_CUR)
     raise UnreadablePhotoError(f"it has more than {MOST_CHUNKS} PNG chunks")
+
+
+_TOLD = (b"eXIf", b"iTXt", b"tEXt", b"zTXt")
+"""Chunks of a PNG that may hold EXIF or XMP, before its pixels or behind them."""
+_PROFILE = "raw profile type "
+
+
+def _told(kind: bytes, content: bytes) -> tuple[str, bytes]:
+    """`exif` or `xmp` and the block that a chunk holds; an empty name for any other text."""
+    if kind == b"eXIf":
+        return "exif", content
+    word, _, rest = content.partition(b"\0")
+    name = word.decode("latin-1").lower()
+    if kind == b"iTXt":
+        packed, rest = rest[:1] == b"\1", rest[2:].partition(b"\0")[2].partition(b"\0")[2]
+    else:
+        packed, rest = kind == b"zTXt", rest[1:] if kind == b"zTXt" else rest
+    if name != "xml:com.adobe.xmp" and not name.startswith(_PROFILE):
+        return "", b""
+    if packed:
+        try:
+            rest = zlib.decompressobj().decompress(rest, MOST_PNG_TEXT)
+        except zlib.error:
+            return "", b""
+    return ("xmp", rest) if not name.startswith(_PROFILE) else _profile(rest)
+
+
+def _profile(text: bytes) -> tuple[str, bytes]:
+    """A block in hexadecimal digits, as ImageMagick writes it: its kind, its length, its bytes."""
+    lines = text.strip().split(b"\n", 2)
+    try:
+        block = bytes.fromhex(lines[-1].decode("ascii"))
+    except ValueError:
+        return "", b""
+    if block.startswith(_XMP_OF_JPEG):
+        return "xmp", block[len(_XMP_OF_JPEG) :]
+    if lines[0].strip() == b"xmp":
+        return "xmp", block
+    return ("exif", block) if block[:4] in (b"Exif", b"II*\0", b"MM\0*") else ("", b"")
 
 
 def read_png(file: BinaryIO, most_mp: float) -> Header:
     """The header of a PNG. Raises `UnreadablePhotoError`, and what Pillow raises."""
-    check_png(file, most_mp)
+    told = check_png(file, most_mp)
     file.seek(0)
     with PngImageFile(file) as image:
-        packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b""
-        packet = packet.encode() if isinstance(packet, str) else packet
-        block = image.info.get("exif") or b""
         gray = image.mode in ("1", "L", "LA") or image.mode.startswith(("I", "F"))
         file.seek(_PNG_BITS)
         deep = file.read(1) == b"\x10"
@@ -240,7 +311,7 @@ def read_png(file: BinaryIO, most_mp: float) -> Header:
             height=image.height,
             channels=1 if gray else 3,
             dtype="uint16" if deep else "uint8",
-            exif=parse_exif(block.removeprefix(b"Exif\x00\x00")),
-            xmp=parse_xmp((packet,) if packet else ()),
+            exif=parse_exif(told.exif.removeprefix(b"Exif\x00\x00")),
+            xmp=parse_xmp(told.xmp),
             alpha=image.has_transparency_data and (not deep or image.mode in ("LA", "RGBA")),
         )

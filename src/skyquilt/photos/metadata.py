@@ -95,10 +95,18 @@ def _xmp_degrees(xmp: Xmp) -> tuple[float | None, float | None] | None:
     """Degrees from XMP. `GpsLongtitude` is DJI's own spelling; other manufacturers use the same
     names.
     """
-    names = ("GpsLatitude",), ("GpsLongitude", "GpsLongtitude")
-    if not any(xmp.text(*n) for n in names):
-        return None
-    return xmp.number(*names[0]), xmp.number(*names[1])
+    for names in _XMP_PLACES:
+        if any(xmp.text(*n) for n in names):
+            return xmp.number(*names[0]), xmp.number(*names[1])
+    return None
+
+
+_XMP_PLACES = (
+    (("GpsLatitude",), ("GpsLongitude", "GpsLongtitude")),
+    (("drone-skydio:Latitude",), ("drone-skydio:Longitude",)),
+    (("drone-dji:Latitude",), ("drone-dji:Longitude",)),
+)
+"""Names of latitude and longitude."""
 
 
 def _exif_degrees(exif: Exif) -> tuple[float | None, float | None] | None:
@@ -120,10 +128,12 @@ def _sexagesimal(value: object, reference: str) -> float | None:
     numbers = [as_number(part) for part in parts[:3]]
     if not numbers or numbers[0] is None:
         return None
-    degrees = sum((n or 0.0) / 60**i for i, n in enumerate(numbers))
+    degrees = sum(abs(n or 0.0) / 60**i for i, n in enumerate(numbers))
     if any(n is None for n in numbers) or not math.isfinite(degrees):
         return None
-    return float(-degrees if reference.upper()[:1] in ("S", "W") else degrees)
+    # some programs write both a sign and a reference
+    negative = any(n is not None and n < 0 for n in numbers)
+    return float(-degrees if negative or reference.upper()[:1] in ("S", "W") else degrees)
 
 
 def _heights(
@@ -152,7 +162,7 @@ def _sane(
 
 def _flown(xmp: Xmp) -> bool:
     """Whether the metadata were written by an autopilot."""
-    return any(key.startswith(("drone-", "Camera:")) for key in xmp.values)
+    return any(key.startswith(("drone-", "drone:", "Camera:")) for key in xmp.values)
 
 
 def _is_rtk(xmp: Xmp) -> bool:
@@ -201,6 +211,7 @@ def _sigmas(exif: Exif, xmp: Xmp, notes: list[str], *, drone: bool) -> tuple[flo
 _GIMBAL = (
     ("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree"),
     ("CameraYawDegree", "CameraPitchDegree", "CameraRollDegree"),
+    tuple(f"CameraOrientationNED.{angle}" for angle in ("Yaw", "Pitch", "Roll")),
 )
 _LOOKS_DOWN_AT_MINUS_90 = -45.0
 _MOST_DEG = 720.0
@@ -211,21 +222,23 @@ _LOOKS_UP_DEG = 80.0
 def read_attitude(xmp: Xmp) -> tuple[Attitude | None, tuple[str, ...]]:
     """Belly angles, or None, with sentences on what is missing.
 
-    `Gimbal*Degree` (DJI, Autel) and `drone-parrot:Camera*Degree` are gimbal angles (pitch -90 =
-    nadir). Pix4D's `Camera:Yaw/Pitch/Roll` (senseFly, Parrot Sequoia, MicaSense) are belly angles:
-    pitch 0 = nadir. Some files contain -90 there for nadir and are read as gimbal angles, because
-    no survey camera looks backwards to the horizon. Gimbal angles that are all zero were not
-    measured; a pitch of +90 is taken for -90.
+    `Gimbal*Degree` (DJI, Autel), `drone-parrot:Camera*Degree` and Skydio's `CameraOrientationNED`
+    are gimbal angles (pitch -90 = nadir). Pix4D's `Camera:Yaw/Pitch/Roll` (senseFly, Parrot
+    Sequoia, MicaSense, older Autels) are belly angles: pitch 0 = nadir. Some files contain -90
+    there for nadir and are read as gimbal angles, because no survey camera looks backwards to the
+    horizon. Angles that are all zero were not measured; a pitch of +90 is taken for -90.
     """
     for names in _GIMBAL:
         yaw, pitch, roll = (xmp.number(name) for name in names)
         if yaw == pitch == roll == 0:
-            return None, ("Its camera angles are all zero: they were not measured.",)
+            return None, _UNMEASURED
         if yaw is not None:
             return _impossible(yaw, pitch, roll) or _from_gimbal(yaw, pitch, roll, "xmp-gimbal")
     yaw, pitch, roll = (xmp.number(f"Camera:{a}") for a in ("Yaw", "Pitch", "Roll"))
     if yaw is not None and (refused := _impossible(yaw, pitch, roll)):
         return refused
+    if yaw == pitch == roll == 0:  # FLIR's cameras write it where no autopilot is connected
+        return None, _UNMEASURED
     if yaw is None:
         return None, ("It has no camera angles.",)
     if pitch is not None and pitch < _LOOKS_DOWN_AT_MINUS_90:
@@ -234,6 +247,9 @@ def read_attitude(xmp: Xmp) -> tuple[Attitude | None, tuple[str, ...]]:
         yaw_deg=yaw, pitch_deg=pitch or 0.0, roll_deg=roll or 0.0, source="xmp-camera"
     )
     return attitude, ()
+
+
+_UNMEASURED = ("Its camera angles are all zero: they were not measured.",)
 
 
 def _impossible(*angles: float | None) -> tuple[None, tuple[str, ...]] | None:

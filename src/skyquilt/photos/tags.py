@@ -6,6 +6,7 @@ import re
 import struct
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from itertools import islice
 from typing import Any, BinaryIO
 
@@ -189,15 +190,17 @@ def _below(
 
 
 _KNOWN = {
-    "http://www.dji.com/drone-dji/1.0": "drone-dji",
-    "http://pix4d.com/camera/1.0": "Camera",
-    "http://www.parrot.com/drone-parrot/1.0": "drone-parrot",
-    "http://ns.adobe.com/xap/1.0": "xmp",
-    "http://ns.adobe.com/xap/1.0/mm": "xmpMM",
-    "http://ns.adobe.com/exif/1.0": "exif",
-    "http://ns.adobe.com/tiff/1.0": "tiff",
-    "http://www.w3.org/1999/02/22-rdf-syntax-ns#": "rdf",
+    "ns.adobe.com/xap/1.0": "xmp",
+    "ns.adobe.com/xap/1.0/mm": "xmpMM",
+    "ns.flir.com/xmp/1.0": "FLIR",
+    "www.w3.org/1999/02/22-rdf-syntax-ns#": "rdf",
 }
+"""Usual prefixes of namespaces, without scheme, whose address does not name them."""
+_CAMERA = re.compile(r"(?:.*/)?camera/[\d.]+", re.IGNORECASE)
+"""Addresses of the namespace that Pix4D defined, and that others (senseFly) write under their own
+name; those of phones end in `camera`.
+"""
+_VERSION = re.compile(r"v?[\d.]+")
 MOST_XMP = 1 << 20
 """Largest XMP packet in bytes that is parsed."""
 MOST_NODES = 200_000
@@ -285,18 +288,46 @@ def _body(packet: bytes) -> bytes:
 
 def _name(tag: str) -> str:
     uri, _, local = tag[1:].partition("}") if tag.startswith("{") else ("", "", tag)
-    key = uri.rstrip("/")
-    return f"{_KNOWN.get(key) or _KNOWN.get(key.lower()) or key.rsplit('/', 1)[-1]}:{local}"
+    return f"{_prefix(uri)}:{local}"
+
+
+@lru_cache(maxsize=256)
+def _prefix(uri: str) -> str:
+    """The usual prefix of a namespace: the last part of its address that is no version number."""
+    place = uri.partition("://")[2] or uri
+    place = place.rstrip("/")
+    if known := _KNOWN.get(place.lower()):
+        return known
+    if _CAMERA.fullmatch(place):
+        return "Camera"
+    words = [w for w in place.split("/") if w and not _VERSION.fullmatch(w)]
+    return words[-1] if words else place
 
 
 def _properties(root: Any) -> Iterator[tuple[str, str]]:
-    """Attributes and elements of every rdf:Description, outermost last so that it wins."""
+    """Attributes and elements of every rdf:Description, outermost last so that it wins; fields of
+    structures as `prefix:Structure.Field`.
+    """
     visits = iter(range(MOST_NODES))
     nodes = list(islice(root.iter(), MOST_NODES))
     for node in reversed([n for n in nodes if _name(n.tag) == "rdf:Description"]):
         yield from ((_name(k), v) for k, v in node.attrib.items())
         for child in node:
             yield _name(child.tag), _value(child, visits)
+            yield from _fields(child)
+
+
+def _fields(node: Any) -> Iterator[tuple[str, str]]:
+    """The fields of a structure, written as attributes of its element, as elements in it, or either
+    of a description in it.
+    """
+    name = _name(node.tag)
+    for inner in (node, *(c for c in node if _name(c.tag) == "rdf:Description")):
+        pairs = [*inner.attrib.items(), *((c.tag, c.text or "") for c in inner if not len(c))]
+        for key, value in pairs:
+            prefix, _, field_ = _name(key).partition(":")
+            if prefix not in ("rdf", "namespace"):  # the latter is that of xml:lang
+                yield f"{name}.{field_}", value.strip()
 
 
 def _value(node: Any, visits: Iterator[int]) -> str:
