@@ -54,7 +54,9 @@ def command(
         ),
     ] = None,
     gsd: Gsd = None,
-    geo: Annotated[Path | None, typer.Option(help="Positions: geo.txt, CSV, .MRK or .SRT.")] = None,
+    geo: Annotated[
+        Path | None, typer.Option(help="Positions: geo.txt, CSV, .MRK, .SRT or .pos.")
+    ] = None,
     cameras: Cameras = None,
     thermal_unit: ThermalUnit = None,
     height: Annotated[float | None, typer.Option(help="Height above ground in m.")] = None,

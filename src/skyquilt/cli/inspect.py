@@ -160,7 +160,7 @@ def command(
     geo: Annotated[
         Path | None,
         typer.Option(
-            help="Side file of positions: geo.txt, CSV, DJI .SRT or .MRK; of videos: .SRT, GPX, a"
+            help="Side file of positions: geo.txt, CSV, .SRT, .MRK or .pos; of videos: .SRT, GPX, a"
             " CSV with times, or a folder of these."
         ),
     ] = None,

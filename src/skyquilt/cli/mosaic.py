@@ -69,8 +69,8 @@ def command(
         Path | None,
         option(
             INPUT,
-            "Positions: geo.txt, CSV, .MRK or .SRT; of videos: .SRT, GPX, a CSV with times, or a"
-            " folder of these.",
+            "Positions: geo.txt, CSV, .MRK, .SRT or .pos; of videos: .SRT, GPX, a CSV with times,"
+            " or a folder of these.",
             default="geo.txt among the photos; for videos the file beside each",
         ),
     ] = None,

@@ -55,7 +55,7 @@ class GeoPosition:
     sigma_z_m: float = 3.0
     """Standard deviation of the height in m."""
     source: str = "exif"
-    """Where it was read: `xmp`, `exif`, `geo.txt`, `csv`, `srt`, `mrk`, `gpx`."""
+    """Where it was read: `xmp`, `exif`, `geo.txt`, `csv`, `srt`, `mrk`, `pos`, `gpx`."""
     takeoff_m: float | None = None
     """Height above take-off in m, where given."""
     sea_level_m: float | None = None

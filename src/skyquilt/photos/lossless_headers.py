@@ -237,7 +237,8 @@ def check_png(file: BinaryIO, most_mp: float = MOST_MP) -> PngMetadata:
     bytes_per_px *= 2 if head[16] == 16 else 1
     check_picture(width, height, bytes_per_px, file_bytes=size, most_mp=most_mp)
     file.seek(8)
-    exif, packets, left = b"", [], MOST_PNG_TEXT
+    packets: list[bytes] = []
+    exif, left = b"", MOST_PNG_TEXT
     for _ in range(MOST_CHUNKS):
         chunk = file.read(8)
         if len(chunk) < 8:

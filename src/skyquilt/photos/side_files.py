@@ -10,18 +10,21 @@ from typing import TYPE_CHECKING
 from skyquilt.errors import SideFileError
 from skyquilt.model.photo import Datum, Photo
 from skyquilt.outside import plain
+from skyquilt.photos.pos_events import read_pos
+from skyquilt.photos.position_tables import has_header, read_positions, states_crs
 from skyquilt.photos.side_rows import (
     SideRow,
     accuracy,
     apply_rows,
+    datum_of,
     finite,
     metres_of_height,
     number,
     of_one_flight,
     read_crs,
     read_lines,
-    read_table,
-    sentence_of,
+    read_text,
+    to_degrees,
     unit_notes,
     with_decimal_commas,
     with_points,
@@ -32,16 +35,12 @@ from skyquilt.photos.srt import read_srt
 def apply_positions(
     photos: Sequence[Photo], file: Path
 ) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
-    """The photos with the positions from a `.csv`, `.mrk`, `.srt` or (any other ending) `geo.txt`
-    file, and notes.
+    """The photos with the positions from an `.mrk`, `.srt` or RTKLIB's `.pos` file, a table or a
+    `geo.txt`, and notes.
 
     Raises `SideFileError` where the file is malformed or contains none of the photos.
     """
     ending = file.suffix.lower()
-    if ending == ".csv":
-        rows, notes = _read_csv(file)
-        placed, said = apply_rows(photos, rows, file=file, source="csv")
-        return placed, (*said, *notes)
     if ending == ".mrk":
         here = os.path.realpath(file.parent)
         beside = {p.name for p in photos if os.path.realpath(p.path.parent) == here}
@@ -49,151 +48,63 @@ def apply_positions(
         return apply_rows(photos, rows, file=file, source="mrk")
     if ending == ".srt":
         return apply_rows(photos, read_srt(file, photos), file=file, source="srt")
+    if ending == ".pos":
+        events, told = read_pos(file, photos)
+        placed, said = apply_rows(photos, events, file=file, source="pos")
+        return placed, (*said, *told)
+    _check_kind(file)
+    if _is_table(file):
+        rows, notes = read_positions(file)
+        placed, said = apply_rows(photos, rows, file=file, source="csv")
+        return placed, (*said, *notes)
     placed, said = apply_rows(photos, read_geo_txt(file), file=file, source="geo.txt")
     crs = read_crs(read_lines(file)[0][1], file=file.name)
     heights = [row.altitude_m for row in read_geo_txt(file)]
     return placed, (*said, *unit_notes(file, crs, heights))
 
 
-_COLUMNS = {
-    "name": ("name", "filename", "file", "image", "imagename", "photo", "label"),
-    "latitude": ("latitude", "lat", "latitudedeg", "gpslatitude"),
-    "longitude": ("longitude", "lon", "lng", "long", "longitudedeg", "gpslongitude"),
-    "sea_level": ("altitude", "alt", "z", "elevation", "height", "altitudem", "gpsaltitude"),
-    "takeoff": ("relativealtitude", "relalt", "takeoff", "takeoffm", "heightabovetakeoff"),
-    "ellipsoid": ("ellipsoid", "ellipsoidm", "ellipsoidalheight", "ellh", "heightellipsoid"),
-    "yaw": ("yaw", "heading", "yawdeg", "gimbalyaw", "gimbalyawdegree"),
-    "pitch": ("pitch", "pitchdeg", "gimbalpitch", "gimbalpitchdegree"),
-    "roll": ("roll", "rolldeg", "gimbalroll", "gimbalrolldegree"),
-    "sigma_xy": (
-        "accuracy",
-        "horizontalaccuracy",
-        "hacc",
-        "accuracyhorz",
-        "sigmaxym",
-        "xyaccuracy",
-    ),
-    "sigma_z": ("verticalaccuracy", "vacc", "accuracyvert", "sigmazm", "zaccuracy"),
+def _is_table(file: Path) -> bool:
+    """Whether a file is a table of positions; otherwise it is a `geo.txt`."""
+    first = next((line for _, line in read_lines(file)), "")
+    if file.suffix.lower() in TABLE_ENDINGS:
+        return not states_crs(first) or has_header(file)
+    return has_header(file)
+
+
+TABLE_ENDINGS = (".csv", ".tsv")
+"""Endings of files that are tables whatever they begin with; others are where they have a header.
+"""
+_NO_TABLE = {
+    "<": "XML (such as GPX, KML or a project of another program)",
+    "{": "JSON",
+    "[{": "JSON",
+    "PK": "a ZIP archive or a spreadsheet",
 }
-_SEPARATOR = re.compile(r"\"?sep=.?\"?", re.IGNORECASE)
-_OTHER_UNIT = re.compile(
-    r"[\[(][^\])]*?\b((?:u\.?s\.? ?)?(?:ft|feet|foot)|rad|radians?|gon|km|cm|mm)\b"
-)
-"""Units in brackets in a header that are not those which are read."""
-_ALIASES = frozenset(alias for aliases in _COLUMNS.values() for alias in aliases)
-_UNITS = ("m", "metre", "metres", "meter", "meters", "deg", "degree", "degrees")
-_WITH_UNIT = re.compile(
-    rf"({'|'.join(sorted(_ALIASES))})"
-    rf"({'|'.join(_UNITS)}|(?:ussurvey|us|intl|international)?(?:ft|feet|foot)|rad|radians?|gon|km|cm|mm)"
-)
-"""Letters of a column's name that ends in its unit."""
-_DATUMS: tuple[Datum, ...] = ("ellipsoid", "takeoff", "sea_level")
+"""How files begin that hold no lines of positions, and what they are."""
+
+
+def _check_kind(file: Path) -> None:
+    """Refuses files in other formats.
+
+    Raises:
+        SideFileError: it is in one.
+    """
+    begin = read_text(file)[:200].lstrip()
+    known = next((said for head, said in _NO_TABLE.items() if begin.startswith(head)), None)
+    if known:
+        raise SideFileError(
+            f"{file.name} is {known}, which is not read for the positions of photos. Export them as"
+            " CSV with the columns name, lat, lon, alt, or as a geo.txt."
+        )
 
 
 def read_positions_csv(path: Path) -> tuple[SideRow, ...]:
-    """One row per photo; raises `SideFileError` where the header or a number is wrong.
-
-    Columns (case, blanks and underscores do not matter): name or filename; lat, lon in degrees; alt
-    (above sea level), rel_alt (above take-off) or ellipsoid in m; yaw, pitch, roll in degrees
-    (pitch 0 = nadir; below -45 it is read as a gimbal's); accuracy, vertical_accuracy in m. Only
-    the name is required. Decimal commas are read where semicolons or tabs separate the columns.
-    """
-    return _read_csv(path)[0]
-
-
-def _read_csv(path: Path) -> tuple[tuple[SideRow, ...], tuple[str, ...]]:
-    """The rows, and a note on columns that are not read."""
-    lines = [line for _, line in read_lines(path)]
-    if lines and _SEPARATOR.fullmatch(lines[0]):  # written by spreadsheets for themselves
-        del lines[0]
-    if not lines:
-        raise SideFileError(f"{path.name} is empty; expected a header and one line per photo.")
-    delimiter = max(",;\t", key=lines[0].count)
-    table = read_table(lines, file=path.name, delimiter=delimiter)
-    columns = _columns(table[0], path)
-    if len(table) < 2:
-        raise SideFileError(f"{path.name} has a header only; expected one line per photo below it.")
-    if delimiter != "," and with_decimal_commas(cell for row in table for cell in row):
-        table = [with_points(row) for row in table]
-    for i, cells in enumerate(table[1:], 1):
-        if any(c.strip() for c in cells[len(table[0]) :]):
-            raise SideFileError(
-                f"{path.name}, row {i} has {len(cells)} cells, and the header {len(table[0])}."
-                " Quote cells with a comma in them, or separate the columns by semicolons."
-            )
-    unread = [c.strip() for k, c in enumerate(table[0]) if k not in columns.values() and c.strip()]
-    rows = tuple(
-        _csv_row(cells, columns, f"{path.name}, row {i}") for i, cells in enumerate(table[1:], 1)
-    )
-    return rows, (
-        (f"{path.name} has columns that are not read: {sentence_of(unread)}.",) if unread else ()
-    )
-
-
-def _columns(header: list[str], path: Path) -> dict[str, int]:
-    words = [_word(cell, path) for cell in header]
-    found = {
-        field: next(words.index(alias) for alias in aliases if alias in words)
-        for field, aliases in _COLUMNS.items()
-        if set(aliases) & set(words)
-    }
-    if "name" not in found or ("latitude" in found) != ("longitude" in found) or len(found) < 2:
-        raise SideFileError(
-            f"{path.name}: its header is '{plain(', '.join(header), 200)}'; expected at least"
-            " 'name' with 'lat' and 'lon', or 'name' with 'yaw'. Add a header line."
-        )
-    return found
-
-
-def _word(cell: str, path: Path) -> str:
-    """The letters of a column's name, without its unit.
-
-    Raises:
-        SideFileError: the column is one that is read, and in another unit.
-    """
-    bare = re.sub(r"[^a-z]", "", re.sub(r"[\[(].*", "", cell.lower()))
-    word = bare if bare in _ALIASES else ""
-    unit = _OTHER_UNIT.search(cell.lower()) if word else None
-    if found := _WITH_UNIT.fullmatch(re.sub(r"[^a-z]", "", cell.lower())):
-        word, unit = found[1], found if found[2] not in _UNITS else None
-    if unit:
-        raise SideFileError(
-            f"{path.name}: the column '{plain(cell, 60)}' is in {unit.groups()[-1]}; expected"
-            " degrees, and heights and accuracies in m. Convert that column."
-        )
-    return word or bare
-
-
-def _csv_row(cells: list[str], columns: dict[str, int], place: str) -> SideRow:
-    values = {f: _cell(cells, c, f, place) for f, c in columns.items() if f != "name"}
-    datum: Datum = next((d for d in _DATUMS if values.get(d) is not None), "sea_level")
-    yaw = values.get("yaw")
-    return SideRow(
-        name=cells[columns["name"]].strip() if len(cells) > columns["name"] else "",
-        latitude_deg=values.get("latitude"),
-        longitude_deg=values.get("longitude"),
-        altitude_m=values.get(datum),
-        datum=datum,
-        angles_deg=None
-        if yaw is None
-        else (yaw, values.get("pitch") or 0.0, values.get("roll") or 0.0),
-        sigma_xy_m=accuracy(values.get("sigma_xy"), place),
-        sigma_z_m=accuracy(values.get("sigma_z"), place) or accuracy(values.get("sigma_xy"), place),
-    )
-
-
-def _cell(cells: list[str], column: int, field: str, place: str) -> float | None:
-    text = cells[column].strip() if column < len(cells) else ""
-    value = number(text)
-    if text and value is None:
-        raise SideFileError(
-            f"{place}: expected a number for {field}, found '{plain(text, 60)}'. Correct that cell."
-        )
-    return finite(value)
+    """One row per photo, see `position_tables.read_positions`."""
+    return read_positions(path)[0]
 
 
 if TYPE_CHECKING:
-    from pyproj import CRS, Transformer
+    from pyproj import Transformer
 
 
 def read_geo_txt(path: Path) -> tuple[SideRow, ...]:
@@ -205,23 +116,16 @@ def read_geo_txt(path: Path) -> tuple[SideRow, ...]:
             " photo."
         )
     crs = read_crs(lines[0][1], file=path.name)
-    to_degrees = _to_degrees(crs)
-    datum: Datum = "ellipsoid" if crs.is_geographic and len(crs.axis_info) == 3 else "sea_level"
+    degrees, datum = to_degrees(crs), datum_of(crs)
     unit_m = metres_of_height(crs)
     return tuple(
-        _geo_txt_row(text, f"{path.name}, line {i}", to_degrees, datum, unit_m)
+        _geo_txt_row(text, f"{path.name}, line {i}", degrees, datum, unit_m)
         for i, text in lines[1:]
     )
 
 
-def _to_degrees(crs: "CRS") -> "Transformer":
-    from pyproj import Transformer
-
-    return Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
-
-
 def _geo_txt_row(
-    line: str, place: str, to_degrees: "Transformer", datum: Datum, unit_m: float
+    line: str, place: str, degrees: "Transformer", datum: Datum, unit_m: float
 ) -> SideRow:
     name, numbers = _split(line)
     if not name or len(numbers) not in (2, 3, 6, 7, 8):
@@ -229,7 +133,7 @@ def _geo_txt_row(
             f"{place}: expected 'name x y [z] [yaw pitch roll [hacc vacc]]', found"
             f" '{plain(line, 200)}'. Correct that line."
         )
-    longitude, latitude = to_degrees.transform(numbers[0], numbers[1])
+    longitude, latitude = degrees.transform(numbers[0], numbers[1])
     values = [finite(v) for v in numbers[2:]] + [None] * 6
     angles = values[1:4]
     return SideRow(
@@ -248,6 +152,7 @@ def _geo_txt_row(
 
 def _split(line: str) -> tuple[str, list[float]]:
     """The name (which may contain spaces) and the numbers after it."""
+    line = line.replace(";", " ")
     words = line.split()
     if any(_GROUPED.fullmatch(w) for w in words):
         return "", []

@@ -260,13 +260,13 @@ def _attitude(row: SideRow, source: str) -> Attitude | None:
 
 
 if TYPE_CHECKING:
-    from pyproj import CRS
+    from pyproj import CRS, Transformer
 
 _UTM = re.compile(r"WGS\s*84\s+UTM\s+(?:zone\s+)?(\d{1,2})\s*([NS])?", re.IGNORECASE)
 
 
-def read_lines(path: Path) -> list[tuple[int, str]]:
-    """Line numbers (from 1) and lines that are neither empty nor comments (`#`).
+def read_lines(path: Path, *, comments: bool = False) -> list[tuple[int, str]]:
+    """Line numbers (from 1) and lines that are neither empty nor, unless asked for, comments (`#`).
 
     Raises `SideFileError` where the file cannot be read as text.
     """
@@ -274,7 +274,7 @@ def read_lines(path: Path) -> list[tuple[int, str]]:
     if "\x00" in text:
         raise SideFileError(f"{path.name} is not a text file; expected lines of words and numbers.")
     lines = ((i, _clean(line.strip())) for i, line in enumerate(text.splitlines(), 1))
-    return [(i, line) for i, line in lines if line and not line.startswith("#")]
+    return [(i, line) for i, line in lines if line and (comments or not line.startswith("#"))]
 
 
 def _clean(line: str) -> str:
@@ -368,6 +368,18 @@ def read_crs(text: str, *, file: str) -> "CRS":
             " UTM 15N', "
             f"but it is '{plain(text, 100)}'. Add one."
         ) from error
+
+
+def to_degrees(crs: "CRS") -> "Transformer":
+    """From x and y of a coordinate system to longitude and latitude."""
+    from pyproj import Transformer
+
+    return Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
+
+
+def datum_of(crs: "CRS") -> Datum:
+    """What heights in a coordinate system count from."""
+    return "ellipsoid" if crs.is_geographic and len(crs.axis_info) == 3 else "sea_level"
 
 
 def metres_of_height(crs: "CRS") -> float:

@@ -220,6 +220,7 @@ def read_survey(
             *_run_notes(found),
             *_closed_note(found),
             *_unread_notes(found),
+            *(_side_note(found, photos) if side is None else ()),
             *greyed,
             *implausible,
             *survey_notes(photos, len(copies) + len(reduced)),
@@ -302,6 +303,21 @@ def _unread_notes(found: FoundFiles) -> tuple[str, ...]:
     return (
         f"{number} not in the map: their format is not read ({sentence_of(missed)}). Save them as"
         " JPEG, TIFF or PNG with their metadata.",
+    )
+
+
+_SIDE_ENDINGS = frozenset({".csv", ".tsv", ".mrk", ".pos"})
+"""Endings of files that may hold positions of photos."""
+
+
+def _side_note(found: FoundFiles, photos: Sequence[Photo]) -> tuple[str, ...]:
+    """A sentence on files that may hold the positions that photos lack."""
+    files = [n for n in found.ignored if PurePosixPath(n).suffix.lower() in _SIDE_ENDINGS]
+    if not files or all(p.position is not None for p in photos):
+        return ()
+    return (
+        f"Photos lack positions, and {sentence_of(files)} may hold them: give such a file by"
+        " --geo.",
     )
 
 
