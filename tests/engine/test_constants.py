@@ -45,6 +45,7 @@ IN_NO_KEY = {
     "SIGMA_YAW_DEG": "repaired metadata are in the key of the alignment, by value",
     "SIGMA_HEIGHT": "the same",
     "YAW_DEG": "conflicts are told in the report and shape nothing",
+    "_EPOCH": "where weeks of GPS begin; positions are in keys by value",
     "CERTAIN": "conflicts are told in the report and shape nothing",
     **dict.fromkeys(
         ("CONTRADICTED_PX", "FEWEST_POSITIONS", "CONTRADICTED_DEVIATIONS", "CONTRADICTED_SHARE")
@@ -54,7 +55,7 @@ IN_NO_KEY = {
     ),
     **dict.fromkeys(
         ("_WIDTH", "_HEIGHT", "_BITS", "_CODEC", "_SAMPLES", "_STRIPS", "_TILES", "_XMP_TAG")
-        + ("_CODECS", "_STRANGE_COLOURS", "_YCBCR", "_JPEGS", "_PNG_BITS"),
+        + ("_CODECS", "_STRANGE_COLOURS", "_YCBCR", "_JPEGS", "_PNG_BITS", "_CFA"),
         "the numbers that the formats TIFF and PNG give to tags",
     ),
     **dict.fromkeys(
@@ -62,7 +63,7 @@ IN_NO_KEY = {
         "which page of a TIFF is the photo changes with the version only, which is in the keys",
     ),
     **dict.fromkeys(
-        ("MOST_CHUNKS", "MOST_STRIPS", "_LEAST_FOCAL", "_MOST"),
+        ("MOST_CHUNKS", "MOST_STRIPS", "MOST_PNG_TEXT", "_LEAST_FOCAL", "_MOST"),
         "limits of files that are refused: they shape no result",
     ),
     **dict.fromkeys(
