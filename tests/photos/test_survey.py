@@ -320,3 +320,44 @@ def test_folders_that_cannot_be_read_are_named(make_jpeg, closed):
         )
     with pytest.raises(NoPhotosError, match="can be found: 1 folder cannot be read"):
         read_survey([hidden])
+
+
+def test_photos_without_their_ending_are_told(make_jpeg):
+    """Recovered and downloaded files; originals and previews beside a photo are none."""
+    folder = flight(make_jpeg, 3)
+    for name in ("12345", "sub/p9.JPG.download"):
+        make_jpeg(name, exif=dji_exif(), seed=40)
+    for name in ("p1.JPG_original", "p1.THM", "a.insp"):
+        make_jpeg(name, seed=41)
+    (folder / "text").write_text("no photo")
+    (told,) = [n for n in read_survey(folder).notes if "by content" in n]
+    assert told.startswith("2 files are photos by content and not by name (12345, sub/p9.JPG")
+
+
+def test_links_to_folders_are_told(make_jpeg, tmp_path_factory):
+    """Those to a folder around them lead to nothing new."""
+    folder, elsewhere = flight(make_jpeg, 2), tmp_path_factory.mktemp("card")
+    (folder / "sub").mkdir()
+    (folder / "sub" / "up").symlink_to(folder)
+    assert not any("link" in n for n in read_survey(folder).notes)
+    (folder / "card").symlink_to(elsewhere)
+    (told,) = [n for n in read_survey(folder).notes if "link" in n]
+    assert told.startswith("1 link to a folder is not followed (card)")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "advice"),
+    [
+        ("IMG_1.HEIC", bytes(20), "Save them as JPEG"),
+        ("DJI_1.DNG", bytes(20), "Save them as JPEG"),
+        ("photos.zip", b"PK", "Unpack photos.zip first"),
+        ("DJI_0001", b"\xff\xd8\xff\xe0", "end in .jpg"),
+    ],
+)
+def test_what_to_do_where_nothing_can_be_read(tmp_path, name, content, advice):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(NoPhotosError, match=advice):
+        read_survey(tmp_path)
+    if name.endswith(".zip"):
+        with pytest.raises(NoPhotosError, match=advice):
+            read_survey(tmp_path / name)

@@ -105,12 +105,14 @@ def shared_notes(survey: "Survey") -> tuple[str, ...]:
 
 def sentences(survey: "Survey", findings: tuple[str, ...]) -> Iterator[str]:
     """What is missing or contradictory, what was left out and why."""
+    from skyquilt.photos.side_rows import sentence_of
+
     yield from (f"All photos: {note}" for note in shared_notes(survey) if len(survey.photos) > 1)
     yield from survey.notes
     yield from findings
     yield from (f"Left out: {r.name}: {r.reason}." for r in survey.rejected)
     if survey.ignored:
-        yield f"Files that are no photos, ignored: {', '.join(survey.ignored)}."
+        yield f"Other files, not used: {sentence_of(survey.ignored)}."
     placed = sum(p.position is not None for p in survey.photos)
     turned = sum(p.attitude is not None for p in survey.photos)
     if survey.photos or not survey.clips:

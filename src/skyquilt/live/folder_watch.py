@@ -14,8 +14,8 @@ from skyquilt.live.ledger import hit
 from skyquilt.live.photo_intake import Accepted, Intake, Refused
 from skyquilt.model.photo import RejectedPhoto
 from skyquilt.outside import PHOTO_ENDINGS, hidden, is_folder, open_regular, same_folder, walk
+from skyquilt.photos.found_files import RUN_MARKS
 from skyquilt.photos.read import read_photo
-from skyquilt.photos.survey import RUN_MARKS
 
 PARTIAL = (".part", ".partial", ".tmp", ".crdownload", ".filepart")
 QUIET_S = 0.04

@@ -1,31 +1,25 @@
 """Reads a folder of files as a `Survey`, the input of a run."""
 
-import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from datetime import datetime
 from itertools import pairwise
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from skyquilt.errors import NoPhotosError
 from skyquilt.model.photo import Photo, RejectedPhoto, Survey
-from skyquilt.outside import MOST_MP, PHOTO_ENDINGS, hidden, plain, walk
+from skyquilt.outside import MOST_MP
 from skyquilt.photos.cameras_json import apply_cameras, read_cameras_json
 from skyquilt.photos.clips import is_timed, read_clips
+from skyquilt.photos.found_files import find_files, notes_on_files, nothing_sentence
 from skyquilt.photos.implausible_positions import (
     with_coarse_deviations,
     without_ground_heights,
     without_outliers,
     without_stuck,
 )
-from skyquilt.photos.left_out import (
-    band_note,
-    paths_of,
-    without_copies,
-    without_maps,
-    without_reduced,
-)
+from skyquilt.photos.left_out import band_note, without_copies, without_maps, without_reduced
 from skyquilt.photos.metadata import INVALID, NO_HEMISPHERE
 from skyquilt.photos.read import ReadPhoto, read_photo
 from skyquilt.photos.recoded import UNNAMED, recoded
@@ -34,129 +28,6 @@ from skyquilt.photos.side_rows import sentence_of
 from skyquilt.photos.thermal import UNREAD
 from skyquilt.photos.thermal_units import in_one_unit, unit_notes
 from skyquilt.settings import InputSettings
-from skyquilt.video.read import CLIP_ENDINGS, side_files
-
-_OTHER_PICTURES = frozenset(
-    f".{ending}"
-    for ending in (
-        *("avif", "bmp", "gif", "heic", "heif", "jp2", "jxl", "webp"),
-        *("arw", "cr2", "cr3", "dng", "nef", "orf", "pef", "r3d", "raf", "raw", "rw2", "srw"),
-    )
-)
-"""Endings of pictures in formats that are not read."""
-RUN_MARKS = frozenset({"run.toml", "live.db", ".skyquilt"})
-"""What the folder of an earlier run or of a live map holds, each one or another of these."""
-_DAMAGED = (
-    "truncated",
-    "cut off",
-    "broken",
-    "damaged",
-    "empty",
-    "cannot be read",
-    "cannot be decoded",
-)
-"""Words in the reasons of files that another copy may not have."""
-_SIDE_NAMES = frozenset({"geo.txt", "gcp_list.txt"})
-
-
-@dataclass(frozen=True, kw_only=True)
-class FoundFiles:
-    """The files in the input."""
-
-    photos: tuple[tuple[str, Path], ...]
-    """Name in the survey and file, sorted by name."""
-    clips: tuple[tuple[str, Path], ...]
-    """The same of video clips."""
-    ignored: tuple[str, ...]
-    """Names of all other files."""
-    geo: Path | None
-    """A `geo.txt` at the top of the folder."""
-    runs: tuple[str, ...]
-    """Folders of earlier runs, which are not read."""
-    unread: tuple[str, ...] = ()
-    """Folders that the system does not let be read, each with the reason."""
-
-
-def find_files(source: Path | Sequence[Path]) -> FoundFiles:
-    """Finds photos by file name extension in a folder and its subfolders, or among single files.
-
-    Hidden files and folders are skipped, those of storage systems (`@eaDir`, `__MACOSX`) too, and
-    so are folders of earlier runs (they contain `run.toml`, or `.skyquilt` while a run is not
-    finished) and of live maps. Raises `UsageError`
-    where a given path does not exist.
-    """
-    paths = paths_of(source)
-    if isinstance(source, (str, os.PathLike)) and paths[0].is_dir():
-        return _in_folder(paths[0])
-    return _listed(paths)
-
-
-def _in_folder(folder: Path) -> FoundFiles:
-    runs: list[str] = []
-    unread: list[str] = []
-
-    def cannot(path: Path, error: OSError) -> None:
-        name = path.relative_to(folder).as_posix() if path != folder else folder.as_posix()
-        unread.append(f"{_text(name)} ({error.strerror or error})")
-
-    found = _walk(folder, runs, folder, cannot)
-    files = [(_text(p.relative_to(folder).as_posix()), p) for p in found]
-    geo = next((p for name, p in files if name.lower() == "geo.txt"), None)
-    return replace(_sorted(files, geo, tuple(sorted(runs))), unread=tuple(sorted(unread)))
-
-
-def _walk(
-    folder: Path, runs: list[str], top: Path, unread: Callable[[Path, OSError], None]
-) -> Iterator[Path]:
-    for here, folders, files in walk(folder, unread):
-        if here != top and not RUN_MARKS.isdisjoint((*files, *folders)):
-            runs.append(_text(here.relative_to(top).as_posix()))
-            folders.clear()
-            continue
-        yield from (here / f for f in files if not hidden(f))
-
-
-def _listed(paths: Sequence[Path]) -> FoundFiles:
-    """Single files: they keep their file names where these differ, else their path below the common
-    folder.
-    """
-    files: list[Path] = []
-    unread: list[str] = []
-    for path in paths:
-        inside = _in_folder(path) if path.is_dir() else None
-        files += [p for _, p in (*inside.photos, *inside.clips)] if inside else [path]
-        unread += inside.unread if inside else ()
-    unique = list(dict.fromkeys(p.absolute() for p in files))
-    top = Path(os.path.commonpath([p.parent for p in unique])) if unique else Path()
-    bare = len({p.name for p in unique}) == len(unique)
-    found = _sorted(
-        [(_text(p.name if bare else p.relative_to(top).as_posix()), p) for p in unique], None, ()
-    )
-    return replace(found, unread=tuple(unread))
-
-
-def _text(name: str) -> str:
-    """A name that can be written to any text file and terminal: Linux allows bytes in file names
-    that are no valid text, and control characters.
-    """
-    return plain(name)
-
-
-def _sorted(
-    files: Sequence[tuple[str, Path]], geo: Path | None, runs: tuple[str, ...]
-) -> FoundFiles:
-    photos = sorted((n, p) for n, p in files if p.suffix.lower() in PHOTO_ENDINGS)
-    clips = sorted((n, p) for n, p in files if p.suffix.lower() in CLIP_ENDINGS)
-    known = {n for n, _ in (*photos, *clips)}
-    beside = {p for _, clip in clips for p in side_files(clip)}
-    ignored = sorted(
-        n
-        for n, p in files
-        if n not in known and p.name.lower() not in _SIDE_NAMES and p not in beside
-    )
-    return FoundFiles(
-        photos=tuple(photos), clips=tuple(clips), ignored=tuple(ignored), geo=geo, runs=runs
-    )
 
 
 def read_survey(
@@ -172,9 +43,9 @@ def read_survey(
     """All photos below a folder (or those given) in order of capture, without decoding their
     pixels.
 
-    `geo` is a side file of positions (`geo.txt`, CSV, `.SRT`, `.MRK`); without one, a `geo.txt` at
-    the top of the folder is used. `cameras` is a `cameras.json`, `thermal_unit` as in `read_photo`,
-    `max_mp` the largest area of a photo in megapixels, `read` what reads a file.
+    `geo` is a side file of positions (`geo.txt`, a table, `.SRT`, `.MRK`, `.pos`); without one, a
+    `geo.txt` at the top of the folder is used. `cameras` is a `cameras.json`, `thermal_unit` as in
+    `read_photo`, `max_mp` the largest area of a photo in megapixels, `read` what reads a file.
     With `clips`, video clips are read too, and timed positions in `geo` (or a folder of such files)
     are those of the clips. A bad photo becomes a `RejectedPhoto`. Raises `UsageError` for a folder
     that does not exist, `NoPhotosError` where no photo can be read, `SideFileError` for a bad side
@@ -198,7 +69,7 @@ def read_survey(
     photos, maps = without_maps(photos)
     photos, reduced = without_reduced(photos)
     if not photos and not films:
-        raise NoPhotosError(_nothing_sentence(folder, found, rejected, clips=clips))
+        raise NoPhotosError(nothing_sentence(folder, found, rejected, clips=clips))
     notes: tuple[str, ...] = ()
     side = geo or found.geo
     if side and photos and not (films and is_timed(side)):
@@ -217,10 +88,7 @@ def read_survey(
         clips=films,
         notes=(
             *notes,
-            *_run_notes(found),
-            *_closed_note(found),
-            *_unread_notes(found),
-            *(_side_note(found, photos) if side is None else ()),
+            *notes_on_files(found, photos, sided=side is not None),
             *greyed,
             *implausible,
             *survey_notes(photos, len(copies) + len(reduced)),
@@ -269,81 +137,6 @@ def capture_order(photo: Photo) -> tuple[bool, datetime, str]:
     """Sort key: wall-clock time, then name; photos without a time come last."""
     time = photo.time.replace(tzinfo=None) if photo.time else datetime.max
     return photo.time is None, time, photo.name
-
-
-def _run_notes(found: FoundFiles) -> tuple[str, ...]:
-    return tuple(f"The folder {run} contains an earlier run and was skipped." for run in found.runs)
-
-
-def _closed_note(found: FoundFiles) -> tuple[str, ...]:
-    """A sentence on folders that cannot be read."""
-    if not found.unread:
-        return ()
-    number = f"{len(found.unread)} folders" if len(found.unread) > 1 else "1 folder"
-    return (
-        f"{number} cannot be read, and photos in there are not in the map:"
-        f" {sentence_of(found.unread)}.",
-    )
-
-
-def _unread_notes(found: FoundFiles) -> tuple[str, ...]:
-    """A sentence on pictures in formats that are not read, but for those beside a photo of the same
-    name, as cameras write them.
-    """
-    read = {PurePosixPath(name).with_suffix("") for name, _ in found.photos}
-    missed = [
-        name
-        for name in found.ignored
-        if PurePosixPath(name).suffix.lower() in _OTHER_PICTURES
-        and PurePosixPath(name).with_suffix("") not in read
-    ]
-    if not missed:
-        return ()
-    number = f"{len(missed)} pictures are" if len(missed) > 1 else "1 picture is"
-    return (
-        f"{number} not in the map: their format is not read ({sentence_of(missed)}). Save them as"
-        " JPEG, TIFF or PNG with their metadata.",
-    )
-
-
-_SIDE_ENDINGS = frozenset({".csv", ".tsv", ".mrk", ".pos"})
-"""Endings of files that may hold positions of photos."""
-
-
-def _side_note(found: FoundFiles, photos: Sequence[Photo]) -> tuple[str, ...]:
-    """A sentence on files that may hold the positions that photos lack."""
-    files = [n for n in found.ignored if PurePosixPath(n).suffix.lower() in _SIDE_ENDINGS]
-    if not files or all(p.position is not None for p in photos):
-        return ()
-    return (
-        f"Photos lack positions, and {sentence_of(files)} may hold them: give such a file by"
-        " --geo.",
-    )
-
-
-def _nothing_sentence(
-    folder: Path | Sequence[Path],
-    found: FoundFiles,
-    rejected: Sequence[RejectedPhoto],
-    *,
-    clips: bool,
-) -> str:
-    where = str(folder) if isinstance(folder, (str, Path)) else f"the {len(folder)} given files"
-    if found.unread and not rejected:
-        return f"There is no photo in {where} that can be found: {_closed_note(found)[0]}"
-    if rejected:
-        reasons = "; ".join(f"{r.name}: {r.reason}" for r in rejected[:5])
-        damaged = any(word in r.reason for r in rejected for word in _DAMAGED)
-        return (
-            f"None of the {len(rejected)} {'image and video' if found.clips else 'image'} files in"
-            f" {where} can be read ({reasons}).{' Copy them again.' if damaged else ''}"
-        )
-    others = (*found.ignored, *(n for n, _ in found.clips)) if not clips else found.ignored
-    held = f"only other files ({sentence_of(others)})" if others else "nothing"
-    return (
-        f"There is no photo in {where}: it contains {held}. Choose a folder of JPEG, TIFF or PNG"
-        f" photos{' or of videos' if clips else ''}."
-    )
 
 
 _LONG_GAP_H = 12.0
