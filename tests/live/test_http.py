@@ -352,7 +352,7 @@ def png_that_claims(width, height):
     ("name", "data", "word"),
     [
         ("text.jpg", b"hello", "neither"),
-        ("page.jpg", b"<html><script>alert(1)</script></html>", "neither"),
+        ("page.jpg", b"<html><script>alert(1)</script></html>", "a web page"),
         ("cut.jpg", None, "truncated"),
         ("bomb.png", png_that_claims(60000, 60000), "megapixels"),
         ("tiny.png", png_that_claims(3, 3), "px"),

@@ -100,6 +100,19 @@ def test_files_that_came_together_are_taken_in_order_of_names(watched, flight):
     assert names == sorted(p.name for p in flight.photos)
 
 
+def test_pictures_that_are_not_read_are_refused_with_what_they_are(watched, flight, monkeypatch):
+    """A JPEG under such a name is a photo; raw pictures lie beside photos and are left alone."""
+    monkeypatch.setattr(watching, "PATIENCE_S", 0.1)
+    for name in ("IMG_1.HEIC", "a.jpg"):
+        (watched.folder / name).write_bytes(b"\0\0\0\x18ftypheic" + bytes(500))
+    (watched.folder / "raw.DNG").write_bytes(b"II*\0" + bytes(500))
+    shutil.copyfile(flight.photos[0], watched.folder / "IMG_2.heic")
+    done = {d.name: d for d in watched.look(0.6)}
+    assert sorted(done) == ["IMG_1.HEIC", "IMG_2.heic", "a.jpg"]
+    assert isinstance(done["IMG_2.heic"], Accepted)
+    assert all("a HEIC picture" in done[n].reason for n in ("IMG_1.HEIC", "a.jpg"))
+
+
 def test_what_is_no_photo_by_its_name_or_not_ready_is_left_alone(watched, flight):
     for name in ("notes.txt", ".hidden.jpg", "a.jpg.part", "b.jpg.crdownload"):
         shutil.copyfile(flight.photos[0], watched.folder / name)

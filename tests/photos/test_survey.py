@@ -361,3 +361,11 @@ def test_what_to_do_where_nothing_can_be_read(tmp_path, name, content, advice):
     if name.endswith(".zip"):
         with pytest.raises(NoPhotosError, match=advice):
             read_survey(tmp_path / name)
+
+
+def test_a_jpeg_that_is_called_heic_is_read(make_jpeg):
+    folder = make_jpeg("IMG_1.HEIC", exif=dji_exif()).parent
+    (folder / "IMG_2.HEIC").write_bytes(b"\0\0\0\x18ftypheic" + bytes(40))
+    survey = read_survey(folder)
+    assert [p.name for p in survey.photos] == ["IMG_1.HEIC"]
+    assert any("1 picture is not in the map" in n and "IMG_2.HEIC" in n for n in survey.notes)

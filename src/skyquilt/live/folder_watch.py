@@ -6,15 +6,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from skyquilt.errors import UsageError
+from skyquilt.errors import UnreadablePhotoError, UsageError
 from skyquilt.live.clip_intake import Taking, advanced, take_clip, unfinished_clip
 from skyquilt.live.closed_files import ClosedFiles
-from skyquilt.live.inbox import ending_of, is_clip
+from skyquilt.live.inbox import is_clip
 from skyquilt.live.ledger import hit
 from skyquilt.live.photo_intake import Accepted, Intake, Refused
 from skyquilt.model.photo import RejectedPhoto
 from skyquilt.outside import PHOTO_ENDINGS, hidden, is_folder, open_regular, same_folder, walk
-from skyquilt.photos.found_files import RUN_MARKS
+from skyquilt.photos.found_files import OTHER_PICTURES, RUN_MARKS
+from skyquilt.photos.headers import HEAD_BYTES, kind_of
 from skyquilt.photos.read import read_photo
 
 PARTIAL = (".part", ".partial", ".tmp", ".crdownload", ".filepart")
@@ -226,15 +227,15 @@ class Watch:
             with open_regular(path) as file:
                 if os.fstat(file.fileno()).st_size > most:
                     return f"it has more than {most / 1e6:g} MB (--max-mb)"
-                head = file.read(8)
+                head = file.read(HEAD_BYTES)
         except FileNotFoundError:
             raise
         except OSError as error:
             return f"it cannot be read ({error.strerror or error})"
-        if not head:
-            return "it is empty (0 bytes)"
-        if ending_of(head) is None:
-            return "its content is neither JPEG, TIFF nor PNG"
+        try:
+            kind_of(head)
+        except UnreadablePhotoError as error:
+            return str(error)
         photo = read_photo(path, most_mp=self.intake.settings.most_mp)
         return photo.reason if isinstance(photo, RejectedPhoto) else ""
 
@@ -246,7 +247,8 @@ def _stored(key: str) -> str:
 
 def _photo_name(name: str) -> bool:
     low = name.lower()
-    taken = low.endswith(PHOTO_ENDINGS) or is_clip(Path(low))
+    # pictures that are not read are refused with a reason, as raw ones beside photos are not
+    taken = low.endswith((*PHOTO_ENDINGS, *OTHER_PICTURES)) or is_clip(Path(low))
     return not hidden(low) and taken and not low.endswith(PARTIAL)
 
 

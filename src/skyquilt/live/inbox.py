@@ -17,6 +17,7 @@ from pathlib import Path
 
 from skyquilt.errors import OutputError, UnreadablePhotoError
 from skyquilt.live.ledger import Ledger, hit
+from skyquilt.photos.headers import HEAD_BYTES, kind_of
 from skyquilt.video.read import CLIP_ENDINGS
 from skyquilt.video.tracks import TRACK_ENDINGS
 
@@ -25,6 +26,7 @@ ENDINGS = {
     b"II*\x00": ".tif",
     b"MM\x00*": ".tif",
     b"II+\x00": ".tif",
+    b"MM\x00+": ".tif",
     b"\x89PNG": ".png",
 }
 """First bytes of the supported file formats, with the file extension."""
@@ -78,18 +80,17 @@ class Inbox:
         except OSError as error:
             raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
 
-    def bring(self, blocks: Iterable[bytes]) -> Arrived | None:
-        """Writes a file's bytes durably under the hash of its content; None if it is not a photo.
+    def bring(self, blocks: Iterable[bytes]) -> Arrived:
+        """Writes a file's bytes durably under the hash of its content.
 
         Raises:
             OutputError: the disk is full.
-            UnreadablePhotoError: the file is larger than allowed, or reading it fails.
+            UnreadablePhotoError: it is not a photo, the file is larger than allowed, or reading it
+                fails.
         """
         rest = iter(blocks)
         first = next(_read(rest), b"")
-        ending = ending_of(first)
-        if ending is None:
-            return None
+        ending = {"jpeg": ".jpg", "tiff": ".tif", "png": ".png"}[kind_of(first[:HEAD_BYTES])]
         partial = self.folder / f"{time.monotonic_ns():x}-{os.getpid()}.partial"
         digest, size = hashlib.blake2b(digest_size=16), 0
         try:

@@ -86,8 +86,6 @@ class Intake:
             arrived = self.inbox.bring(blocks)
         except UnreadablePhotoError as error:
             return self.refuse(name, source, str(error))
-        if arrived is None:
-            return self.refuse(name, source, "its content is neither JPEG, TIFF nor PNG")
         try:
             return self._enter(arrived, name, source)
         except OutputError:

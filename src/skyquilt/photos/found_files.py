@@ -11,14 +11,30 @@ from skyquilt.photos.left_out import paths_of
 from skyquilt.photos.side_rows import sentence_of
 from skyquilt.video.read import CLIP_ENDINGS, side_files
 
-_OTHER_PICTURES = frozenset(
+OTHER_PICTURES = (*(".avif", ".bmp", ".gif", ".heic", ".heif", ".insp", ".jp2", ".jxl", ".webp"),)
+"""Endings of pictures in formats that are not read."""
+_RAW = frozenset(
     f".{ending}"
     for ending in (
-        *("avif", "bmp", "gif", "heic", "heif", "insp", "jp2", "jxl", "webp"),
-        *("arw", "cr2", "cr3", "dng", "nef", "orf", "pef", "r3d", "raf", "raw", "rw2", "srw"),
+        *(
+            "arw",
+            "cr2",
+            "cr3",
+            "dng",
+            "nef",
+            "orf",
+            "pef",
+            "r3d",
+            "insp",
+            "raf",
+            "raw",
+            "rw2",
+            "srw",
+        ),
     )
 )
-"""Endings of pictures in formats that are not read."""
+"""The same of raw pictures, which cameras write beside photos, and of two fisheyes in one file."""
+_UNREAD = frozenset(OTHER_PICTURES) | _RAW
 RUN_MARKS = frozenset({"run.toml", "live.db", ".skyquilt"})
 """What the folder of an earlier run or of a live map holds, each one or another of these."""
 _DAMAGED = (
@@ -122,7 +138,7 @@ def _text(name: str) -> str:
 def _sorted(
     files: Sequence[tuple[str, Path]], geo: Path | None, runs: tuple[str, ...]
 ) -> FoundFiles:
-    photos = sorted((n, p) for n, p in files if p.suffix.lower() in PHOTO_ENDINGS)
+    photos = sorted((n, p) for n, p in files if _is_photo(p))
     clips = sorted((n, p) for n, p in files if p.suffix.lower() in CLIP_ENDINGS)
     known = {n for n, _ in (*photos, *clips)}
     beside = {p for _, clip in clips for p in side_files(clip)}
@@ -183,7 +199,7 @@ def _unread_notes(found: FoundFiles) -> tuple[str, ...]:
     missed = [
         name
         for name in found.ignored
-        if PurePosixPath(name).suffix.lower() in _OTHER_PICTURES
+        if PurePosixPath(name).suffix.lower() in _UNREAD
         and PurePosixPath(name).with_suffix("") not in read
     ]
     if not missed:
@@ -208,7 +224,7 @@ def _misnamed_note(found: FoundFiles) -> tuple[str, ...]:
     missed = [
         name
         for name, path in found.others[:_MOST_LOOKED]
-        if PurePosixPath(name).suffix.lower() not in _OTHER_PICTURES
+        if PurePosixPath(name).suffix.lower() not in _UNREAD
         and PurePosixPath(name).with_suffix("") not in read
         and _begins_as_photo(path)
     ]
@@ -219,6 +235,14 @@ def _misnamed_note(found: FoundFiles) -> tuple[str, ...]:
         f"{number} by content and not by name ({sentence_of(missed)}), and not in the map. Give"
         " them names that end in .jpg or .png.",
     )
+
+
+def _is_photo(path: Path) -> bool:
+    """Whether a file is to be read: by its name, or a JPEG or PNG that is called something else, as
+    phones hand over `.heic` files that they converted.
+    """
+    ending = path.suffix.lower()
+    return ending in PHOTO_ENDINGS or (ending in OTHER_PICTURES and _begins_as_photo(path))
 
 
 def _begins_as_photo(path: Path) -> bool:

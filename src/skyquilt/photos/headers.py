@@ -241,7 +241,7 @@ def read_header(path: Path, *, most_mp: float = MOST_MP) -> Header:
     """
     try:
         with open_regular(path) as file:
-            kind = _kind(file)
+            kind = kind_of(file.read(HEAD_BYTES))
             if kind == "jpeg":
                 return _jpeg(file, most_mp)
             from skyquilt.photos.lossless_headers import read_png, read_tiff  # most are JPEGs
@@ -305,19 +305,23 @@ _BOXES = {
 """The same of files of the ISO base media format, by their brand."""
 
 
-def _kind(file: BinaryIO) -> Kind:
-    head = file.read(8)
+HEAD_BYTES = 12
+"""So many bytes at the beginning of a file tell its kind."""
+
+
+def kind_of(head: bytes) -> Kind:
+    """The kind of photo that begins so; raises `UnreadablePhotoError` with what it is otherwise."""
     if not head:
         raise UnreadablePhotoError("it is empty (0 bytes)")
     if head[:2] == b"\xff\xd8":
         return "jpeg"
     if head[:4] in _TIFF_MAGIC:
         return "tiff"
-    if head == b"\x89PNG\r\n\x1a\n":
+    if head[:8] == b"\x89PNG\r\n\x1a\n":
         return "png"
     known = next((name for magic, name in _OTHERS.items() if head.startswith(magic)), "")
     if head[4:8] == b"ftyp":
-        known = _BOXES.get(file.read(4)[:3], "a video or HEIF picture")
+        known = _BOXES.get(head[8:11], "a video or HEIF picture")
     if known:
         saved = "; save it as JPEG, TIFF or PNG with its metadata" if "picture" in known else ""
         raise UnreadablePhotoError(f"its content is {known}, whatever its name{saved}")
