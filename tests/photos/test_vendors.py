@@ -7,10 +7,12 @@ import zlib
 import numpy as np
 import piexif
 import pytest
+import tifffile
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from skyquilt.model.photo import RejectedPhoto
+from skyquilt.photos.pixels import read_color
 from skyquilt.photos.read import read_photo
 
 from .conftest import dji_exif, dji_xmp, gps_exif, jpeg_bytes, pixels
@@ -226,10 +228,56 @@ def test_jpegs_of_many_bits_or_without_loss_are_told(tmp_path, frame):
 
 
 def test_raw_pictures_are_not_taken_for_grey_ones(tmp_path):
-    import tifffile
-
     raw = pixels()[..., 1].astype(np.uint16) * 60
     pattern = [(33421, "H", 2, (2, 2), True), (33422, "B", 4, b"\0\1\1\2", True)]
     tifffile.imwrite(tmp_path / "a.tif", raw, photometric=32803, extratags=pattern)
     found = read_photo(tmp_path / "a.tif")
     assert isinstance(found, RejectedPhoto) and "raw picture" in found.reason
+
+
+FLIR = (
+    'xmlns:FLIR="http://ns.flir.com/xmp/1.0/" xmlns:Camera="http://pix4d.com/camera/1.0" '
+    '{prefix}:TlinearGain="{gain}" {prefix}:BandName="LWIR"'
+)
+
+
+@pytest.mark.parametrize("prefix", ["FLIR", "Camera"])
+@pytest.mark.parametrize(
+    ("gain", "counts", "said", "degrees"),
+    [
+        ("0.04", 7329, None, 20.01),
+        ("0.4", 733, None, 20.05),
+        ("0.01", 29315, None, 20.0),
+        ("0.00", 29315, None, 20.0),  # not linear: derived from the values
+        ("0.04", 29315, "centikelvin", 20.0),
+    ],
+)
+def test_counts_of_flir_are_linear_in_kelvins(tmp_path, prefix, gain, counts, said, degrees):
+    """The maker's manual: counts * 0.04 - 273.15, or 0.40 with the wide range."""
+    frame = np.full((128, 160), counts, np.uint16)
+    frame[40:60, 50:80] += 100
+    frame[0, 0] = 0
+    xmp = packet("", FLIR.format(prefix=prefix, gain=gain)).encode()
+    path = tmp_path / "a.tiff"
+    tifffile.imwrite(path, frame, extratags=[(700, "B", len(xmp), xmp, True)])
+    photo = read_photo(path, thermal_unit=said)
+    assert (photo.band, photo.unit) == ("thermal", "celsius")
+    values = read_color(photo)
+    assert np.nanmedian(values) == pytest.approx(degrees, abs=0.01)
+    step = {None: float(gain) or 0.01, "centikelvin": 0.01}[said]
+    assert values[50, 60] - values[0, 90] == pytest.approx(100 * step, abs=1e-3)
+    assert np.isnan(values[0, 0]) and np.isfinite(values[0, 1])
+
+
+@pytest.mark.parametrize(("width", "band"), [(4000, "visible"), (640, "thermal")])
+def test_a_visible_picture_of_a_rig_that_says_lwir(make_jpeg, width, band):
+    """FLIR's Duo Pro R writes the band of its thermal eye into both files."""
+    xmp = packet("", FLIR.format(prefix="Camera", gain="0"))
+    image = np.zeros((width * 3 // 4, width, 3), np.uint8)
+    assert read_photo(make_jpeg(xmp=xmp, image=image)).band == band
+
+
+def test_a_date_of_gps_with_a_time(make_jpeg):
+    gps = gps_exif(46.5, 9.0) | {7: ((15, 1), (28, 1), (54, 1)), 29: "2017:09:16 15:28:54"}
+    exif = {"0th": {}, "Exif": {}, "GPS": gps}
+    assert read_photo(make_jpeg(exif=exif)).time.isoformat() == "2017-09-16T15:28:54+00:00"

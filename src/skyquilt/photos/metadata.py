@@ -364,7 +364,8 @@ def _zone(text: str) -> timezone | None:
 def _gps_time(exif: Exif) -> datetime | None:
     clock = exif.gps.get(tag.GPS_TIME)
     parts = [as_number(p) for p in clock] if isinstance(clock, (tuple, list)) else []
-    day = parse_moment(as_text(exif.gps.get(tag.GPS_DATE)) + " 00:00:00")
+    # some cameras write the time behind the date, too
+    day = parse_moment(as_text(exif.gps.get(tag.GPS_DATE))[:10] + " 00:00:00")
     if day is None or len(parts) != 3 or None in parts:
         return None
     hours, minutes, seconds = (p or 0.0 for p in parts)

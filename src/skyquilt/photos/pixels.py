@@ -20,12 +20,19 @@ from skyquilt.model.photo import Photo
 from skyquilt.outside import open_regular
 from skyquilt.photos.detector_faults import repaired
 from skyquilt.photos.headers import content_digest, read_header
-from skyquilt.photos.tags import GDAL_METADATA, MAKE
-from skyquilt.photos.thermal import stated_scale, thermal_frame_of_jpeg, thermal_frame_of_values
+from skyquilt.photos.tags import GDAL_METADATA, MAKE, MOST_XMP, Xmp, parse_xmp
+from skyquilt.photos.thermal import (
+    linear_gain,
+    stated_scale,
+    thermal_frame_of_jpeg,
+    thermal_frame_of_values,
+)
 from skyquilt.video.decoder import frame_of
 
 Pixels = NDArray[Any]
 Reduction = Literal[1, 2, 4, 8]
+_XMP = 700
+"""Tag of a TIFF with its XMP packet."""
 _NODATA = 42113
 """GDAL's tag of a TIFF: the value of pixels that have none, as text."""
 _HARMLESS = re.compile(
@@ -132,7 +139,7 @@ def _decode(photo: Photo, reduction: Reduction, *, gray: bool) -> Pixels:
             return decode_jpeg(data, gray=gray or photo.channels == 1, reduction=reduction)
         if head == b"\x89PNG":
             return reduce_pixels(_png(file, photo), reduction)
-        pixels = read_tiff(file, size, scaled=bool(photo.unit))
+        pixels = read_tiff(file, size, scaled=bool(photo.unit), stored=photo.stored)
     if photo.channels == 1:
         pixels = pixels[..., 0]
     elif photo.channels == 3 and pixels.shape[2] == 1:  # grey among photos in colour
@@ -213,11 +220,14 @@ def _emptied(pixels: Pixels, alpha: Pixels) -> Pixels:
     return np.where(shown, pixels, np.asarray(empty, pixels.dtype))
 
 
-def read_tiff(file: BinaryIO, size: tuple[int, int], *, scaled: bool = False) -> Pixels:
+def read_tiff(
+    file: BinaryIO, size: tuple[int, int], *, scaled: bool = False, stored: str = ""
+) -> Pixels:
     """The page of a TIFF that is the photo as (height, width, bands) without alpha, signed and
     wide types as float32, black and white as 0 and 255, palettes and inks as RGB, pixels that are
     see-through or hold the value that stands for none as black or NaN; `size`: the width and height
-    that were checked; `scaled`: by the scale and offset that GDAL's tags state.
+    that were checked; `scaled`: by the scale and offset that GDAL's tags state, or where values
+    mean kelvins (`stored`), by FLIR's kelvins per count.
     """
     import tifffile  # imported here because most photos are JPEGs
 
@@ -232,6 +242,9 @@ def read_tiff(file: BinaryIO, size: tuple[int, int], *, scaled: bool = False) ->
         alpha = [int(e) in (1, 2) for e in page.extrasamples]
         void, beside = _void_value(page), has_band_beside(page)
         scale = stated_scale(_text(page, GDAL_METADATA)) if scaled else None
+        if scaled and scale is None and stored == "kelvin" and pixels.dtype == np.uint16:
+            gain = linear_gain(_xmp_of(tiff.pages.first))
+            scale = None if gain is None else (gain, 0.0)
     if planar:
         pixels = np.moveaxis(pixels, 0, -1)
     if pixels.dtype == np.bool_:  # one bit for each pixel; `white` is the one that stands for it
@@ -261,6 +274,13 @@ def read_tiff(file: BinaryIO, size: tuple[int, int], *, scaled: bool = False) ->
         if empty is not None:
             pixels[empty] = np.nan
     return np.ascontiguousarray(pixels)
+
+
+def _xmp_of(page: Any) -> Xmp:
+    """The XMP packet of a page of a TIFF."""
+    told = page.tags.get(_XMP)
+    packet = told.value if told is not None and told.count <= MOST_XMP else b""
+    return parse_xmp((packet,) if isinstance(packet, bytes) and packet else ())
 
 
 def _void_value(page: Any) -> float | None:

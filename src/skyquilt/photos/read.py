@@ -45,6 +45,7 @@ from skyquilt.photos.thermal import (
     ThermalFrame,
     has_raw_data,
     like_reflectance,
+    linear_gain,
     stated_scale,
     stated_unit,
     thermal_frame_of_jpeg,
@@ -304,10 +305,12 @@ def _thermal_frame(path: Path, header: Header, said: str | None) -> ThermalFrame
     check_picture(header.width, header.height, 4, most_mp=MOST_THERMAL_MP, option="")
     try:
         with open_regular(path) as file:
-            values = read_tiff(file, (header.width, header.height), scaled=True)[..., 0]
+            size = (header.width, header.height)
+            values = read_tiff(file, size, scaled=True, stored=stored)[..., 0]
         if not known and like_reflectance(values):
             return None
-        scaled = stated_scale(header.exif.text(tag.GDAL_METADATA)) is not None
+        converted = values.dtype.kind == "f" and header.stored.startswith("uint")
+        scaled = stated_scale(header.exif.text(tag.GDAL_METADATA)) is not None or converted
         kind = values.dtype.name if scaled else header.stored
         frame = thermal_frame_of_values(np.asarray(values), stored, kind)
     except UnreadablePhotoError:
@@ -318,11 +321,17 @@ def _thermal_frame(path: Path, header: Header, said: str | None) -> ThermalFrame
 
 
 def _stated(header: Header) -> Stored:
-    return stated_unit(f"{header.exif.text(tag.DESCRIPTION)} {header.exif.text(tag.GDAL_METADATA)}")
+    told = stated_unit(f"{header.exif.text(tag.DESCRIPTION)} {header.exif.text(tag.GDAL_METADATA)}")
+    linear = header.dtype == "uint16" and linear_gain(header.xmp) is not None
+    return told or ("kelvin" if linear else "")
 
 
 def _is_lwir(header: Header) -> bool:
-    return "lwir" in header.xmp.text("Camera:BandName").lower()
+    """Whether the file says that it shows a long-wave band; FLIR's rigs say it of their visible
+    pictures, too.
+    """
+    large = header.channels > 1 and max(header.width, header.height) > _LARGEST_THERMAL
+    return not large and "lwir" in header.xmp.text("Camera:BandName", "FLIR:BandName").lower()
 
 
 def _band_name(header: Header) -> str:

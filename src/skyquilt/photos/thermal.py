@@ -12,6 +12,7 @@ from skyquilt.model.photo import Stored
 from skyquilt.outside import real
 from skyquilt.photos.flir import read_flir
 from skyquilt.photos.headers import APP3, JpegHeader
+from skyquilt.photos.tags import Xmp
 
 _DJI_SIZES = ((640, 512), (1280, 1024), (640, 480), (336, 256), (320, 256), (256, 192), (160, 120))
 _CENTIKELVIN = (22_000, 42_000)
@@ -141,6 +142,14 @@ def stated_scale(text: str) -> tuple[float, float] | None:
     if scale is None or offset is None or not scale or (scale, offset) == (1.0, 0.0):
         return None
     return scale, offset
+
+
+def linear_gain(xmp: Xmp) -> float | None:
+    """Kelvins per count that FLIR's TIFFs state (`TlinearGain`: Duo Pro R, Vue Pro R, Zenmuse XT2);
+    None where counts are not linear in temperature, or nothing is stated.
+    """
+    gain = xmp.number("TlinearGain")
+    return gain if gain is not None and 0 < gain <= 1 else None
 
 
 def thermal_frame_of_values(
