@@ -227,6 +227,20 @@ def test_photos_of_one_shot_in_several_bands_have_its_place(tmp_path, make_jpeg)
     assert [p.position.latitude_deg for p in after] == [pytest.approx(46.1)] * 2
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        "DJI_20230309104838_0002_V.JPG",
+        "DJI_20230309104838_0002_W_field 7.JPG",
+        "DJI_20230309104838_0002_D_2024.JPG",
+        "100_0003_0002.JPG",
+    ],
+)
+def test_the_number_of_a_shot_in_names_of_missions(tmp_path, make_jpeg, name):
+    (after, _) = apply_positions(flights(make_jpeg, name), written(tmp_path, MRK, "t.MRK"))
+    assert after[0].position.latitude_deg == pytest.approx(46.2)
+
+
 def test_frames_of_two_videos_do_not_share_a_telemetry(tmp_path, make_jpeg):
     photos = flights(make_jpeg, "a/frame_0001.JPG", "b/frame_0001.JPG")
     photos = [replace(p, time=None) for p in photos]

@@ -91,6 +91,11 @@ def _check_kind(file: Path) -> None:
     """
     begin = read_text(file)[:200].lstrip()
     known = next((said for head, said in _NO_TABLE.items() if begin.startswith(head)), None)
+    if "<gpx" in begin:
+        raise SideFileError(
+            f"{file.name} is a GPX track, which is read for videos only. Write it into the photos"
+            f" first (ExifTool: exiftool -geotag {file.name} PHOTOS)."
+        )
     if known:
         raise SideFileError(
             f"{file.name} is {known}, which is not read for the positions of photos. Export them as"
@@ -172,7 +177,8 @@ _LINE = re.compile(
     rf"^([0-9]{{1,9}})\s++\S++\s++\[[0-9]++\]{_NUMBER},\s*N{_NUMBER},\s*E{_NUMBER},\s*V"
     rf"{_NUMBER},\s*Lat{_NUMBER},\s*Lon{_NUMBER},\s*Ellh(?:{_NUMBER},{_NUMBER},{_NUMBER})?"
 )
-_SHOT = re.compile(r"_([0-9]{4,18})(?:_[A-Za-z]+)?$")
+_SHOT = re.compile(r"^DJI_[0-9]{12,14}_([0-9]{4,6})(?=_|$)|_([0-9]{4,18})(?:_[A-Za-z]+)?$")
+"""The number of a shot in a photo's name; behind it may stand the lens, and words of a mission."""
 _METRES_PER_DEGREE = 111_320.0
 
 
@@ -212,7 +218,7 @@ def read_mrk(
 
 def _index(name: str) -> int:
     found = _SHOT.search(Path(name).stem)
-    return int(found[1]) if found else -1
+    return int(found[1] or found[2]) if found else -1
 
 
 def _mrk_row(name: str, shot: list[float | None]) -> SideRow:
