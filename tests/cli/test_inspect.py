@@ -63,3 +63,16 @@ def test_inspect_nothing(tmp_path):
     result = CliRunner().invoke(app, ["inspect", str(tmp_path)])
     assert isinstance(result.exception, NoPhotosError)
     assert result.exception.exit_code == 3
+
+
+def test_several_paths_are_one_survey(folder):
+    """As a shell makes them of `photos/*`: the side file among them counts."""
+    (folder / "card").mkdir()
+    (folder / "card" / "DJI_7.JPG").write_bytes(jpeg_bytes(pixels(seed=7), dji_exif(), XMP))
+    (folder / "geo.txt").write_text("EPSG:4326\nDJI_0 -92.001 46.501 300\n")
+    paths = [folder / n for n in ("DJI_0.JPG", "DJI_1.JPG", "card", "geo.txt")]
+    result = CliRunner().invoke(app, ["inspect", *map(str, paths), "--json"])
+    assert result.exit_code == 0, result.output
+    photos = {p["name"]: p for p in json.loads(result.output)["photos"]}
+    assert sorted(photos) == ["DJI_0.JPG", "DJI_1.JPG", "DJI_7.JPG"]
+    assert photos["DJI_0.JPG"]["position"]["latitude_deg"] == 46.501

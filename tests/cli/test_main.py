@@ -95,6 +95,17 @@ def test_exit_codes_are_those_of_the_errors():
     assert stated == {0, 130} | {e.exit_code for e in leaves}
 
 
+def test_a_mosaic_of_several_paths(monkeypatch, capsys, tmp_path):
+    """Which a shell makes of `photos/*.JPG`."""
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    paths = [tmp_path / "a", tmp_path / "b"]
+    assert run(monkeypatch, "mosaic", *paths, "-o", tmp_path / "out") == 3
+    assert "no photo in the 2 given folders" in capsys.readouterr().err
+    assert run(monkeypatch, "mosaic", *paths, "-o", tmp_path / "o", "--thermal", tmp_path) == 2
+    assert "one folder of visible photos" in capsys.readouterr().err
+
+
 def test_codes_tell_errors_apart():
     leaves = [
         errors.UsageError,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from skyquilt.cli.options import MaxMp
+from skyquilt.cli.options import MaxMp, PhotoPaths, source_of
 from skyquilt.outside import MOST_MP, plain, shown
 
 if TYPE_CHECKING:
@@ -156,9 +156,7 @@ def _height(position: "GeoPosition | None") -> str:
 
 
 def command(
-    photos: Annotated[
-        Path, typer.Argument(help="Folder of photos and videos (subfolders included), or one file.")
-    ],
+    photos: PhotoPaths,
     geo: Annotated[
         Path | None,
         typer.Option(
@@ -178,7 +176,7 @@ def command(
     from skyquilt.settings import within
 
     within("--max-mp", max_mp, 0.01, 10_000)
-    survey = read_survey(photos, geo=geo, cameras=cameras, max_mp=max_mp, clips=True)
+    survey = read_survey(source_of(photos), geo=geo, cameras=cameras, max_mp=max_mp, clips=True)
     findings = contradictions(survey.photos)
     if json:
         record = {**asdict(survey), "contradictions": findings}

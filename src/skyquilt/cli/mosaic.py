@@ -17,9 +17,10 @@ from skyquilt.cli.options import (
     THERMAL_UNITS,
     UNIT_UNSAID,
     VERTICAL_DATUMS,
-    Photos,
+    PhotoPaths,
     mode_of,
     parse_bounds,
+    source_of,
 )
 from skyquilt.errors import UsageError
 from skyquilt.outside import MOST_MP
@@ -44,7 +45,7 @@ def option(panel: str, text: str, *names: str, default: str | None = None) -> An
 
 
 def command(
-    photos: Photos,
+    photos: PhotoPaths,
     output: Annotated[Path, option(COMMON, "Folder for the results.", "--output", "-o")],
     gsd: Annotated[
         float | None, option(COMMON, "Ground size of a map pixel in cm.", default="the photos' own")
@@ -342,6 +343,7 @@ def command(
     ):
         if add and given:
             raise UsageError(f"--add and {other} exclude one another")
+    source = source_of(photos)
     mode = mode_of(quiet=quiet, json=json, verbose=verbose)
     exporting = _exporting(export, output)
     settings = MosaicSettings(
@@ -401,13 +403,15 @@ def command(
                 f"--thermal-route {thermal_route!r} needs --thermal, a folder of photos"
             )
         events = iter_mosaic(
-            photos, output, settings, overwrite=overwrite, rerun_from=rerun_from, add=add
+            source, output, settings, overwrite=overwrite, rerun_from=rerun_from, add=add
         )
     else:
         from skyquilt.thermal.workflow import iter_thermal
 
+        if len(photos) > 1:
+            raise UsageError("--thermal needs one folder of visible photos, not several paths")
         events = iter_thermal(
-            photos,
+            photos[0],
             thermal,
             output,
             settings,

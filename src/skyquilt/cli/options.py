@@ -12,6 +12,10 @@ from skyquilt.errors import UsageError
 Mode = Literal["quiet", "normal", "verbose", "json"]
 
 Photos = Annotated[Path, typer.Argument(help="Folder of photos and videos (subfolders included).")]
+PhotoPaths = Annotated[
+    list[Path],
+    typer.Argument(help="Folder of photos and videos (subfolders included); or several, or files."),
+]
 Output = Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")]
 Gsd = Annotated[
     float | None,
@@ -100,3 +104,8 @@ def in_percent(option: typer.CallbackParam, value: float | None) -> float | None
     if value is not None and 0 < value < 1:
         raise UsageError(f"{option.opts[0]} is in percent: {100 * value:g}, not {value:g}")
     return value
+
+
+def source_of(paths: list[Path]) -> Path | list[Path]:
+    """The one folder or file that is given, or all of them."""
+    return paths[0] if len(paths) == 1 else paths

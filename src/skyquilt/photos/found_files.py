@@ -111,19 +111,25 @@ def _walk(
 
 def _listed(paths: Sequence[Path]) -> FoundFiles:
     """Single files: they keep their file names where these differ, else their path below the common
-    folder.
+    folder. A `geo.txt` among them counts, and one of a folder, where there is one only.
     """
     files: list[Path] = []
     unread: list[str] = []
+    geo = [p for p in paths if p.name.lower() == "geo.txt" and p.is_file()]
     for path in paths:
         inside = _in_folder(path) if path.is_dir() else None
-        files += [p for _, p in (*inside.photos, *inside.clips)] if inside else [path]
+        files += (
+            [p for _, p in (*inside.photos, *inside.clips, *inside.others)] if inside else [path]
+        )
         unread += inside.unread if inside else ()
+        geo += [inside.geo] if inside and inside.geo else []
     unique = list(dict.fromkeys(p.absolute() for p in files))
     top = Path(os.path.commonpath([p.parent for p in unique])) if unique else Path()
     bare = len({p.name for p in unique}) == len(unique)
     found = _sorted(
-        [(_text(p.name if bare else p.relative_to(top).as_posix()), p) for p in unique], None, ()
+        [(_text(p.name if bare else p.relative_to(top).as_posix()), p) for p in unique],
+        geo[0] if len(geo) == 1 else None,
+        (),
     )
     return replace(found, unread=tuple(unread))
 
@@ -293,7 +299,10 @@ def nothing_sentence(
     clips: bool,
 ) -> str:
     """Why there is nothing to map. `clips`: whether videos are read, too."""
-    where = str(folder) if isinstance(folder, (str, Path)) else f"the {len(folder)} given files"
+    where = str(folder)
+    if not isinstance(folder, (str, Path)):
+        kind = "folders" if all(is_folder(Path(p)) for p in folder) else "files"
+        where = f"the {len(folder)} given {kind}"
     if found.unread and not rejected:
         return f"There is no photo in {where} that can be found: {_closed_note(found)[0]}"
     if rejected:

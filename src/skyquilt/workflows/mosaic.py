@@ -334,8 +334,8 @@ def recipe_of(given: SurveyInput, settings: MosaicSettings, methods: Methods) ->
     files = (settings.picture.boundary, settings.input.distances, Path(settings.input.sequence))
     side = [content_digest(p) for p in files if p is not None and p.is_file()]
     if given.survey.clips:  # control points are read when the frames are known
-        gcp = settings.input.gcp or Path(str(given.source)) / "gcp_list.txt"
-        side += [content_digest(gcp)] if gcp.is_file() else []
+        gcp = given.control_file(settings.input.gcp)
+        side += [content_digest(gcp)] if gcp is not None and gcp.is_file() else []
         side.append(digest(frame_methods(settings.input)))
     return digest(list(given.control), shaping, side, methods, make_map, __version__)
 

@@ -53,7 +53,21 @@ class SurveyInput:
     @property
     def title(self) -> str:
         """The name of the folder, or the number of files."""
-        return str(self.source) if isinstance(self.source, Path) else f"{len(self.source)} files"
+        if isinstance(self.source, Path):
+            return str(self.source)
+        folders = all(Path(p).is_dir() for p in self.source)
+        return f"{len(self.source)} {'folders' if folders else 'files'}"
+
+    def control_file(self, asked: Path | None) -> Path | None:
+        """The file of control points that is asked for, else the only gcp_list.txt in a folder of
+        photos or among files that are given.
+        """
+        if asked is not None:
+            return asked
+        given = [self.source] if isinstance(self.source, Path) else [Path(p) for p in self.source]
+        found = [p for p in given if p.name == "gcp_list.txt" and p.is_file()]
+        found += [p / "gcp_list.txt" for p in given if (p / "gcp_list.txt").is_file()]
+        return found[0] if len(found) == 1 else None
 
     def gone(self) -> tuple[RejectedPhoto, ...]:
         """Photos whose files are no longer the ones that were read."""
@@ -165,14 +179,12 @@ def completed(given: SurveyInput, settings: InputSettings) -> SurveyInput:
     Raises:
         SideFileError: a side file is malformed.
     """
-    survey, source = given.survey, given.source
+    survey = given.survey
     if settings.lever_arm is not None:
         photos, notes = with_lever_arm(survey.photos, settings.lever_arm)
         survey = replace(survey, photos=photos, notes=(*survey.notes, *notes))
     names = [p.name for p in survey.photos]
-    gcp = settings.gcp
-    if gcp is None and isinstance(source, Path) and (source / "gcp_list.txt").is_file():
-        gcp = source / "gcp_list.txt"
+    gcp = given.control_file(settings.gcp)
     control: tuple[ControlPoint, ...] = ()
     if gcp is not None:
         control, notes = read_gcp_list(gcp, names)
