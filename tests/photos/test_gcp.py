@@ -51,3 +51,28 @@ def test_one_point_at_two_places_of_a_photo_is_refused(tmp_path, photo):
     with pytest.raises(SideFileError, match=r"a is observed at two places of DJI_0001.JPG"):
         checked(tmp_path, photo, "EPSG:4326\n" + "".join(rows))
     assert len(checked(tmp_path, photo, "EPSG:4326\n" + 2 * rows[0])) == 1
+
+
+ROW = ("446363.450", "5160978.180", "437.678", "33.10", "51.48", "DJI_0001.JPG", "p 1")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "\t".join(ROW),
+        ",".join(ROW),
+        ", ".join(ROW),
+        ";".join(ROW),
+        ";".join(w.replace(".", ",") for w in ROW[:5]) + ";" + ";".join(ROW[5:]),
+        "\t".join(w.replace(".", ",") for w in ROW[:5]) + "\t" + "\t".join(ROW[5:]),
+        "geo_x geo_y geo_z im_x im_y image_name gcp_name\n" + "\t".join(ROW),
+        "x,y,z,px,py,image,name\n" + ",".join(ROW),
+    ],
+)
+def test_columns_as_spreadsheets_write_them(tmp_path, text):
+    path = tmp_path / "gcp_list.txt"
+    path.write_text(f"EPSG:32633\n{text}\n")
+    ((point,), notes) = read_gcp_list(path, ["DJI_0001.JPG"])
+    assert (point.name, point.x, point.y, point.z) == ("p 1", 446363.45, 5160978.18, 437.678)
+    ((seen,), _) = (point.observations, notes)
+    assert (seen.photo, seen.x, seen.y) == ("DJI_0001.JPG", 33.1, 51.48)

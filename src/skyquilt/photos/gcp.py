@@ -26,6 +26,8 @@ from skyquilt.photos.side_rows import (
     read_lines,
     sentence_of,
     unit_notes,
+    with_decimal_commas,
+    with_points,
 )
 
 if TYPE_CHECKING:
@@ -66,7 +68,8 @@ def read_gcp_list(
     crs = read_crs(lines[0][1], file=path.name)
     epsg = crs.to_epsg()
     unit_m = metres_of_height(crs)
-    observations = [_observation(text, f"{path.name}, line {i}", unit_m) for i, text in lines[1:]]
+    rows = lines[2:] if len(lines) > 2 and _is_header(lines[1][1]) else lines[1:]
+    observations = [_observation(text, f"{path.name}, line {i}", unit_m) for i, text in rows]
     names = PhotoNames(photo_names)
     strangers = sorted({s.image for s in observations if names.find(s.image) is None})
     if all(names.find(s.image) is None for s in observations):
@@ -109,9 +112,27 @@ def _notes(path: Path, strangers: list[str], points: list[ControlPoint]) -> tupl
     return tuple(n for n in (missing, lost) if n)
 
 
+def _words(line: str) -> list[str]:
+    """The columns of a line, separated by tabs, blanks, semicolons or commas, numbers with decimal
+    points.
+    """
+    for mark in ("\t", None, ";", ","):
+        words = [w.strip() for w in line.split(mark) if w.strip()]
+        if mark != "," and with_decimal_commas(words):
+            words = with_points(words)
+        if len(words) >= 6 and all(number(w) is not None for w in words[:2]):
+            return words
+    return line.replace(",", " ").replace(";", " ").split()
+
+
+def _is_header(line: str) -> bool:
+    """Whether a line names the columns (`geo_x geo_y geo_z im_x im_y image_name ...`)."""
+    words = _words(line)
+    return len(words) >= 6 and all(w[0].isalpha() and number(w) is None for w in words[:6])
+
+
 def _observation(line: str, place: str, unit_m: float) -> _Observation:
-    words = line.split("\t") if line.count("\t") >= 5 else line.split()
-    words = [w.strip() for w in words if w.strip()]
+    words = _words(line)
     numbers = [number(w) for w in words[:5]]
     x, y, z, column, row = (*numbers, *[None] * 5)[:5]
     wanted = (finite(v) for v in (x, y, column, row))
