@@ -369,3 +369,14 @@ def test_a_jpeg_that_is_called_heic_is_read(make_jpeg):
     survey = read_survey(folder)
     assert [p.name for p in survey.photos] == ["IMG_1.HEIC"]
     assert any("1 picture is not in the map" in n and "IMG_2.HEIC" in n for n in survey.notes)
+
+
+def test_versions_of_photos_are_told(make_jpeg):
+    """Cards on which names begin anew have other times."""
+    folder = make_jpeg("a/DJI_0001.JPG", exif=dji_exif()).parent.parent
+    later = dji_exif(Exif={piexif.ExifIFD.DateTimeOriginal: "2016:06:23 17:31:59"})
+    make_jpeg("b/DJI_0001.JPG", exif=later, seed=1)
+    assert not any("versions" in n for n in read_survey(folder).notes)
+    make_jpeg("edited/dji_0001.jpeg", exif=dji_exif(), seed=2)
+    (told,) = [n for n in read_survey(folder).notes if "versions" in n]
+    assert told.startswith("1 photo has the name") and "dji_0001.jpeg of a/DJI_0001.JPG" in told

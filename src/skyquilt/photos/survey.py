@@ -1,11 +1,11 @@
 """Reads a folder of files as a `Survey`, the input of a run."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import replace
 from datetime import datetime
 from itertools import pairwise
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from skyquilt.errors import NoPhotosError
 from skyquilt.model.photo import Photo, RejectedPhoto, Survey
@@ -152,6 +152,7 @@ def survey_notes(photos: Sequence[Photo], copies: int = 0) -> tuple[str, ...]:
         *(unit_notes(photos) if any(map(_may_be_thermal, photos)) else ()),
         *_gaps(photos),
         *_clocks(photos),
+        *_versions(photos),
         *_copies(copies),
     )
 
@@ -173,6 +174,30 @@ def _cameras(photos: Sequence[Photo]) -> Iterator[str]:
         yield (
             f"{deep} photos in colour have floating-point values: these are mapped as recorded,"
             " without a balance of brightness; for one, save them with 8 or 16 bits."
+        )
+
+
+def _versions(photos: Sequence[Photo]) -> Iterator[str]:
+    """A sentence on photos that may be several versions of one: of one name, time and place. Rigs
+    of several cameras write such files, too, so none is left out.
+    """
+    first: dict[Hashable, str] = {}
+    again: list[str] = []
+    for photo in photos:
+        place = photo.position
+        if photo.time is None or place is None:
+            continue
+        where = round(place.latitude_deg, 5), round(place.longitude_deg, 5)
+        stem = PurePosixPath(photo.name).stem.lower()
+        size = photo.width, photo.height
+        key = stem, photo.time, where, size, photo.band, photo.band_name
+        if first.setdefault(key, photo.name) != photo.name:
+            again.append(f"{photo.name} of {first[key]}")
+    if again:
+        number = f"{len(again)} photos have" if len(again) > 1 else "1 photo has"
+        yield (
+            f"{number} the name, time and place of others ({sentence_of(again)}): where they are"
+            " versions of the same photos (edited, exported, another format), leave one kind out."
         )
 
 
