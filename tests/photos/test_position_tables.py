@@ -6,6 +6,7 @@ import pyproj
 import pytest
 
 from skyquilt.errors import SideFileError
+from skyquilt.photos.clips import is_timed
 from skyquilt.photos.position_tables import degrees_of
 from skyquilt.photos.read import read_photo
 from skyquilt.photos.side_files import apply_positions
@@ -213,6 +214,20 @@ def test_events_that_do_not_match_are_refused(tmp_path, flight, text, words):
     path.write_text(text)
     with pytest.raises(SideFileError, match=words):
         apply_positions(flight, path)
+
+
+@pytest.mark.parametrize(
+    ("header", "timed"),
+    [
+        ("SourceFile,GPSLatitude,GPSLongitude,Time", False),
+        ("Bild;Latitude;Longitude;Time", False),
+        ("Time,Latitude,Longitude", True),
+    ],
+)
+def test_a_table_that_names_photos_is_not_that_of_a_video(tmp_path, header, timed):
+    path = tmp_path / "a.csv"
+    path.write_text(header + "\n")
+    assert is_timed(path) == timed
 
 
 def test_a_table_beside_photos_without_positions_is_pointed_at(make_jpeg):

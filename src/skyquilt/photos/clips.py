@@ -13,6 +13,7 @@ from skyquilt.model.clip import ChosenFrames, Clip, Track
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.outside import PHOTO_ENDINGS, hidden, walk
 from skyquilt.photos.kept_frames import KEPT_QUALITY
+from skyquilt.photos.position_tables import has_header
 from skyquilt.photos.read import read_photo
 from skyquilt.photos.video_modes import with_mode
 from skyquilt.video.positions import attitude_at, clip_zero, flight_yaw_at, places_at, position_at
@@ -25,7 +26,8 @@ _SAME_START_S = 2.0
 def is_timed(side: Path) -> bool:
     """Whether a side file holds positions by time, as clips need, not by the names of photos."""
     ending = side.suffix.lower()
-    return side.is_dir() or ending in (".srt", ".gpx") or (ending == ".csv" and is_timed_csv(side))
+    timed = ending == ".csv" and is_timed_csv(side) and not has_header(side)
+    return timed or side.is_dir() or ending in (".srt", ".gpx")
 
 
 def read_clips(
