@@ -1,40 +1,22 @@
-"""The files in the input: photos, clips, side files, and sentences on all others."""
+"""What a folder of photos contains, and sentences on what of it is not in the survey."""
 
 import os
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from skyquilt.model.photo import Photo, RejectedPhoto
-from skyquilt.outside import PHOTO_ENDINGS, hidden, is_folder, open_regular, plain, walk
-from skyquilt.photos.left_out import paths_of
+from skyquilt.model.photo import RejectedPhoto
+from skyquilt.outside import is_folder, open_regular
 from skyquilt.photos.side_rows import sentence_of
-from skyquilt.video.read import CLIP_ENDINGS, side_files
 
-OTHER_PICTURES = (*(".avif", ".bmp", ".gif", ".heic", ".heif", ".insp", ".jp2", ".jxl", ".webp"),)
+OTHER_PICTURES = (".avif", ".bmp", ".gif", ".heic", ".heif", ".jp2", ".jxl", ".webp")
 """Endings of pictures in formats that are not read."""
 _RAW = frozenset(
-    f".{ending}"
-    for ending in (
-        *(
-            "arw",
-            "cr2",
-            "cr3",
-            "dng",
-            "nef",
-            "orf",
-            "pef",
-            "r3d",
-            "insp",
-            "raf",
-            "raw",
-            "rw2",
-            "srw",
-        ),
-    )
+    (".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".pef", ".r3d", ".raf", ".raw", ".rw2", ".srw")
 )
-"""The same of raw pictures, which cameras write beside photos, and of two fisheyes in one file."""
-_UNREAD = frozenset(OTHER_PICTURES) | _RAW
+"""The same of raw pictures, which cameras write beside photos."""
+_UNREAD = frozenset(OTHER_PICTURES) | _RAW | {".insp"}
+"""All of them, and pictures of two fisheyes."""
 RUN_MARKS = frozenset({"run.toml", "live.db", ".skyquilt"})
 """What the folder of an earlier run or of a live map holds, each one or another of these."""
 _DAMAGED = (
@@ -47,7 +29,6 @@ _DAMAGED = (
     "cannot be decoded",
 )
 """Words in the reasons of files that another copy may not have."""
-_SIDE_NAMES = frozenset({"geo.txt", "gcp_list.txt"})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,102 +51,9 @@ class FoundFiles:
     """Name and path of the files in `ignored`."""
 
 
-def find_files(source: Path | Sequence[Path]) -> FoundFiles:
-    """Finds photos by file name extension in a folder and its subfolders, or among single files.
-
-    Hidden files and folders are skipped, those of storage systems (`@eaDir`, `__MACOSX`) too, and
-    so are folders of earlier runs (they contain `run.toml`, or `.skyquilt` while a run is not
-    finished) and of live maps. Raises `UsageError`
-    where a given path does not exist.
-    """
-    paths = paths_of(source)
-    if isinstance(source, (str, os.PathLike)) and paths[0].is_dir():
-        return _in_folder(paths[0])
-    return _listed(paths)
-
-
-def _in_folder(folder: Path) -> FoundFiles:
-    runs: list[str] = []
-    unread: list[str] = []
-
-    def cannot(path: Path, error: OSError) -> None:
-        name = path.relative_to(folder).as_posix() if path != folder else folder.as_posix()
-        unread.append(f"{_text(name)} ({error.strerror or error})")
-
-    found = _walk(folder, runs, folder, cannot)
-    files = [(_text(p.relative_to(folder).as_posix()), p) for p in found]
-    geo = next((p for name, p in files if name.lower() == "geo.txt"), None)
-    return replace(_sorted(files, geo, tuple(sorted(runs))), unread=tuple(sorted(unread)))
-
-
-def _walk(
-    folder: Path, runs: list[str], top: Path, unread: Callable[[Path, OSError], None]
-) -> Iterator[Path]:
-    for here, folders, files in walk(folder, unread):
-        if here != top and not RUN_MARKS.isdisjoint((*files, *folders)):
-            runs.append(_text(here.relative_to(top).as_posix()))
-            folders.clear()
-            continue
-        yield from (here / f for f in files if not hidden(f))
-
-
-def _listed(paths: Sequence[Path]) -> FoundFiles:
-    """Single files: they keep their file names where these differ, else their path below the common
-    folder. A `geo.txt` among them counts, and one of a folder, where there is one only.
-    """
-    files: list[Path] = []
-    unread: list[str] = []
-    geo = [p for p in paths if p.name.lower() == "geo.txt" and p.is_file()]
-    for path in paths:
-        inside = _in_folder(path) if path.is_dir() else None
-        files += (
-            [p for _, p in (*inside.photos, *inside.clips, *inside.others)] if inside else [path]
-        )
-        unread += inside.unread if inside else ()
-        geo += [inside.geo] if inside and inside.geo else []
-    unique = list(dict.fromkeys(p.absolute() for p in files))
-    top = Path(os.path.commonpath([p.parent for p in unique])) if unique else Path()
-    bare = len({p.name for p in unique}) == len(unique)
-    found = _sorted(
-        [(_text(p.name if bare else p.relative_to(top).as_posix()), p) for p in unique],
-        geo[0] if len(geo) == 1 else None,
-        (),
-    )
-    return replace(found, unread=tuple(unread))
-
-
-def _text(name: str) -> str:
-    """A name that can be written to any text file and terminal: Linux allows bytes in file names
-    that are no valid text, and control characters.
-    """
-    return plain(name)
-
-
-def _sorted(
-    files: Sequence[tuple[str, Path]], geo: Path | None, runs: tuple[str, ...]
-) -> FoundFiles:
-    photos = sorted((n, p) for n, p in files if _is_photo(p))
-    clips = sorted((n, p) for n, p in files if p.suffix.lower() in CLIP_ENDINGS)
-    known = {n for n, _ in (*photos, *clips)}
-    beside = {p for _, clip in clips for p in side_files(clip)}
-    others = sorted(
-        (n, p)
-        for n, p in files
-        if n not in known and p.name.lower() not in _SIDE_NAMES and p not in beside
-    )
-    return FoundFiles(
-        photos=tuple(photos),
-        clips=tuple(clips),
-        ignored=tuple(n for n, _ in others),
-        geo=geo,
-        runs=runs,
-        others=tuple(others),
-    )
-
-
-def notes_on_files(found: FoundFiles, photos: Sequence[Photo], *, sided: bool) -> tuple[str, ...]:
-    """Sentences on what is in the input and not in the survey. `sided`: whether a side file gives
-    positions.
+def notes_on_files(found: FoundFiles, *, placeless: bool) -> tuple[str, ...]:
+    """Sentences on what is in the input and not in the survey. `placeless`: whether photos lack
+    positions, and no side file is given.
     """
     return (
         *_run_notes(found),
@@ -173,7 +61,7 @@ def notes_on_files(found: FoundFiles, photos: Sequence[Photo], *, sided: bool) -
         *_unread_notes(found),
         *_misnamed_note(found),
         *_link_note(found),
-        *(() if sided else _side_note(found, photos)),
+        *(_side_note(found) if placeless else ()),
     )
 
 
@@ -232,7 +120,7 @@ def _misnamed_note(found: FoundFiles) -> tuple[str, ...]:
         for name, path in found.others[:_MOST_LOOKED]
         if PurePosixPath(name).suffix.lower() not in _UNREAD
         and PurePosixPath(name).with_suffix("") not in read
-        and _begins_as_photo(path)
+        and begins_as_photo(path)
     ]
     if not missed:
         return ()
@@ -243,15 +131,8 @@ def _misnamed_note(found: FoundFiles) -> tuple[str, ...]:
     )
 
 
-def _is_photo(path: Path) -> bool:
-    """Whether a file is to be read: by its name, or a JPEG or PNG that is called something else, as
-    phones hand over `.heic` files that they converted.
-    """
-    ending = path.suffix.lower()
-    return ending in PHOTO_ENDINGS or (ending in OTHER_PICTURES and _begins_as_photo(path))
-
-
-def _begins_as_photo(path: Path) -> bool:
+def begins_as_photo(path: Path) -> bool:
+    """Whether a file begins as a JPEG or PNG."""
     try:
         with open_regular(path) as file:
             return file.read(8).startswith(_BEGINNINGS)
@@ -280,10 +161,10 @@ _SIDE_ENDINGS = frozenset({".csv", ".tsv", ".mrk", ".pos"})
 """Endings of files that may hold positions of photos."""
 
 
-def _side_note(found: FoundFiles, photos: Sequence[Photo]) -> tuple[str, ...]:
+def _side_note(found: FoundFiles) -> tuple[str, ...]:
     """A sentence on files that may hold the positions that photos lack."""
     files = [n for n in found.ignored if PurePosixPath(n).suffix.lower() in _SIDE_ENDINGS]
-    if not files or all(p.position is not None for p in photos):
+    if not files:
         return ()
     return (
         f"Photos lack positions, and {sentence_of(files)} may hold them: give such a file by"

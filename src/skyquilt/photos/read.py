@@ -16,7 +16,6 @@ from skyquilt.model.camera import Camera
 from skyquilt.model.photo import Focal, Photo, RejectedPhoto, Stored
 from skyquilt.outside import MOST_MP, check_picture, open_regular, plain, whole
 from skyquilt.photos import tags as tag
-from skyquilt.photos.exif_of_xmp import with_xmp
 from skyquilt.photos.flir import MOST_THERMAL_MP
 from skyquilt.photos.headers import Header, content_digest, read_header
 from skyquilt.photos.lens import (
@@ -87,7 +86,7 @@ def read_photo(
     name = name or plain(path.name)
     try:
         header = read_header(path, most_mp=most_mp)
-        header = replace(header, exif=with_xmp(header.exif, header.xmp))
+        header = replace(header, exif=tag.with_xmp(header.exif, header.xmp))
         return _photo(path, name, header, thermal_unit)
     except Exception as error:  # one unexpected file must not stop a survey of thousands
         return rejected(name, error)

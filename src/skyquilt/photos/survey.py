@@ -1,7 +1,8 @@
 """Reads a folder of files as a `Survey`, the input of a run."""
 
+import os
 from collections import Counter
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import replace
 from datetime import datetime
 from itertools import pairwise
@@ -9,17 +10,30 @@ from pathlib import Path, PurePosixPath
 
 from skyquilt.errors import NoPhotosError
 from skyquilt.model.photo import Photo, RejectedPhoto, Survey
-from skyquilt.outside import MOST_MP
+from skyquilt.outside import MOST_MP, PHOTO_ENDINGS, hidden, plain, walk
 from skyquilt.photos.cameras_json import apply_cameras, read_cameras_json
 from skyquilt.photos.clips import is_timed, read_clips
-from skyquilt.photos.found_files import find_files, notes_on_files, nothing_sentence
+from skyquilt.photos.found_files import (
+    OTHER_PICTURES,
+    RUN_MARKS,
+    FoundFiles,
+    begins_as_photo,
+    notes_on_files,
+    nothing_sentence,
+)
 from skyquilt.photos.implausible_positions import (
     with_coarse_deviations,
     without_ground_heights,
     without_outliers,
     without_stuck,
 )
-from skyquilt.photos.left_out import band_note, without_copies, without_maps, without_reduced
+from skyquilt.photos.left_out import (
+    band_note,
+    paths_of,
+    without_copies,
+    without_maps,
+    without_reduced,
+)
 from skyquilt.photos.metadata import INVALID, NO_HEMISPHERE
 from skyquilt.photos.read import ReadPhoto, read_photo
 from skyquilt.photos.recoded import UNNAMED, recoded
@@ -28,6 +42,110 @@ from skyquilt.photos.side_rows import sentence_of
 from skyquilt.photos.thermal import UNREAD
 from skyquilt.photos.thermal_units import in_one_unit, unit_notes
 from skyquilt.settings import InputSettings
+from skyquilt.video.read import CLIP_ENDINGS, side_files
+
+_SIDE_NAMES = frozenset({"geo.txt", "gcp_list.txt"})
+
+
+def find_files(source: Path | Sequence[Path]) -> FoundFiles:
+    """Finds photos by file name extension in a folder and its subfolders, or among single files.
+
+    Hidden files and folders are skipped, those of storage systems (`@eaDir`, `__MACOSX`) too, and
+    so are folders of earlier runs (they contain `run.toml`, or `.skyquilt` while a run is not
+    finished) and of live maps. Raises `UsageError`
+    where a given path does not exist.
+    """
+    paths = paths_of(source)
+    if isinstance(source, (str, os.PathLike)) and paths[0].is_dir():
+        return _in_folder(paths[0])
+    return _listed(paths)
+
+
+def _in_folder(folder: Path) -> FoundFiles:
+    runs: list[str] = []
+    unread: list[str] = []
+
+    def cannot(path: Path, error: OSError) -> None:
+        name = path.relative_to(folder).as_posix() if path != folder else folder.as_posix()
+        unread.append(f"{_text(name)} ({error.strerror or error})")
+
+    found = _walk(folder, runs, folder, cannot)
+    files = [(_text(p.relative_to(folder).as_posix()), p) for p in found]
+    geo = next((p for name, p in files if name.lower() == "geo.txt"), None)
+    return replace(_sorted(files, geo, tuple(sorted(runs))), unread=tuple(sorted(unread)))
+
+
+def _walk(
+    folder: Path, runs: list[str], top: Path, unread: Callable[[Path, OSError], None]
+) -> Iterator[Path]:
+    for here, folders, files in walk(folder, unread):
+        if here != top and not RUN_MARKS.isdisjoint((*files, *folders)):
+            runs.append(_text(here.relative_to(top).as_posix()))
+            folders.clear()
+            continue
+        yield from (here / f for f in files if not hidden(f))
+
+
+def _listed(paths: Sequence[Path]) -> FoundFiles:
+    """Single files: they keep their file names where these differ, else their path below the common
+    folder. A `geo.txt` among them counts, and one of a folder, where there is one only.
+    """
+    files: list[Path] = []
+    unread: list[str] = []
+    geo = [p for p in paths if p.name.lower() == "geo.txt" and p.is_file()]
+    for path in paths:
+        inside = _in_folder(path) if path.is_dir() else None
+        files += (
+            [p for _, p in (*inside.photos, *inside.clips, *inside.others)] if inside else [path]
+        )
+        unread += inside.unread if inside else ()
+        geo += [inside.geo] if inside and inside.geo else []
+    unique = list(dict.fromkeys(p.absolute() for p in files))
+    top = Path(os.path.commonpath([p.parent for p in unique])) if unique else Path()
+    bare = len({p.name for p in unique}) == len(unique)
+    found = _sorted(
+        [(_text(p.name if bare else p.relative_to(top).as_posix()), p) for p in unique],
+        geo[0] if len(geo) == 1 else None,
+        (),
+    )
+    return replace(found, unread=tuple(unread))
+
+
+def _text(name: str) -> str:
+    """A name that can be written to any text file and terminal: Linux allows bytes in file names
+    that are no valid text, and control characters.
+    """
+    return plain(name)
+
+
+def _sorted(
+    files: Sequence[tuple[str, Path]], geo: Path | None, runs: tuple[str, ...]
+) -> FoundFiles:
+    photos = sorted((n, p) for n, p in files if _is_photo(p))
+    clips = sorted((n, p) for n, p in files if p.suffix.lower() in CLIP_ENDINGS)
+    known = {n for n, _ in (*photos, *clips)}
+    beside = {p for _, clip in clips for p in side_files(clip)}
+    others = sorted(
+        (n, p)
+        for n, p in files
+        if n not in known and p.name.lower() not in _SIDE_NAMES and p not in beside
+    )
+    return FoundFiles(
+        photos=tuple(photos),
+        clips=tuple(clips),
+        ignored=tuple(n for n, _ in others),
+        geo=geo,
+        runs=runs,
+        others=tuple(others),
+    )
+
+
+def _is_photo(path: Path) -> bool:
+    """Whether a file is to be read: by its name, or a JPEG or PNG that is called something else, as
+    phones hand over `.heic` files that they converted.
+    """
+    ending = path.suffix.lower()
+    return ending in PHOTO_ENDINGS or (ending in OTHER_PICTURES and begins_as_photo(path))
 
 
 def read_survey(
@@ -88,7 +206,9 @@ def read_survey(
         clips=films,
         notes=(
             *notes,
-            *notes_on_files(found, photos, sided=side is not None),
+            *notes_on_files(
+                found, placeless=side is None and any(p.position is None for p in photos)
+            ),
             *greyed,
             *implausible,
             *survey_notes(photos, len(copies) + len(reduced)),

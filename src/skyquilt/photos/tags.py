@@ -5,7 +5,7 @@ import math
 import re
 import struct
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import islice
 from typing import Any, BinaryIO
@@ -343,3 +343,49 @@ def _searched(packet: bytes) -> dict[str, str]:
     text = packet.decode("utf-8", "replace")
     pairs = [(m[1], m[2] or m[3] or "") for m in _ATTRIBUTE.finditer(text)]
     return dict(pairs + [(m[1], m[2]) for m in _ELEMENT.finditer(text) if m[1] == m[3]])
+
+
+_TEXTS = {MAKE: "tiff:Make", MODEL: "tiff:Model", SERIAL: "aux:SerialNumber", LENS: "aux:Lens"}
+_NUMBERS = {
+    FOCAL_MM: "exif:FocalLength",
+    FOCAL_35MM: "exif:FocalLengthIn35mmFilm",
+    ZOOM: "exif:DigitalZoomRatio",
+    PLANE_X: "exif:FocalPlaneXResolution",
+    PLANE_UNIT: "exif:FocalPlaneResolutionUnit",
+    PIXELS_X: "exif:PixelXDimension",
+    PIXELS_Y: "exif:PixelYDimension",
+}
+_PART = r"(\d{1,3}(?:\.\d{1,15})?)"
+_ANGLE = re.compile(rf"{_PART}(?:,{_PART})?(?:,{_PART})?\s?([NSEWnsew])", re.ASCII)
+"""Degrees as XMP writes them: `46,35.985N` or `46,35,59.1N`."""
+
+
+def with_xmp(exif: Exif, xmp: Xmp) -> Exif:
+    """The tags, and those of XMP's `tiff` and `exif` for what is absent; a position as a whole."""
+    told: dict[int, Any] = {t: text for t, name in _TEXTS.items() if (text := xmp.text(name))}
+    numbers = {t: parse_number(xmp.text(name)) for t, name in _NUMBERS.items()}
+    told |= {t: number for t, number in numbers.items() if number is not None}
+    if (turned := parse_number(xmp.text("tiff:Orientation"))) is not None:
+        told[ORIENTATION] = int(turned)
+    missing = {t: value for t, value in told.items() if t not in exif.tags}
+    places = {} if GPS_LAT in exif.gps or GPS_LON in exif.gps else _places(xmp)
+    if not missing and not places:
+        return exif
+    return replace(exif, tags={**exif.tags, **missing}, gps={**exif.gps, **places})
+
+
+def _places(xmp: Xmp) -> dict[int, Any]:
+    """The position in XMP as a GPS directory; empty where it is not whole."""
+    found: dict[int, Any] = {}
+    axes = (("exif:GPSLatitude", GPS_LAT, GPS_LAT_REF), ("exif:GPSLongitude", GPS_LON, GPS_LON_REF))
+    for name, value, reference in axes:
+        parts = _ANGLE.fullmatch(xmp.text(name))
+        if parts is None:
+            return {}
+        found[value] = tuple(float(p) for p in parts.groups()[:3] if p is not None)
+        found[reference] = parts[4]
+    height = parse_number(xmp.text("exif:GPSAltitude"))
+    if height is not None:
+        found[GPS_ALT] = height
+        found[GPS_ALT_REF] = int(parse_number(xmp.text("exif:GPSAltitudeRef")) or 0)
+    return found
