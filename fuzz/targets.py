@@ -375,6 +375,19 @@ CSV = (
     b"name,lat,lon,alt,yaw,pitch,roll,accuracy,vertical_accuracy\n"
     b"SIM_0001.jpg,52.1,13.1,100,10,-90,0,0.1,0.2\nSIM_0002.jpg,52.1,13.1,100,10,-45,0,0.1,0.2\n"
 )
+TABLE = (
+    b"# CoordinateSystem: EPSG:32633\n#Label,X/Easting,Y/Northing,Z/Altitude,Yaw,Accuracy_(m)\n"
+    b"SIM_0001.jpg,369850,5773400,100,10,0.1\nSIM_0002.jpg,369860,5773400,100,10,0.1\n"
+)
+DEGREES = (
+    "Bild;Breite;L\u00e4nge;H\u00f6he\nSIM_0001.jpg;52\u00b006'00,5\"N;13 deg 6' E;100,5 m\n"
+).encode()
+BARE = b"SIM_0001.jpg,52.1,13.1,100\nSIM_0002.jpg,52.1,13.2,100\n"
+POS = (
+    b"%  GPST latitude(deg) longitude(deg) height(m) Q ns sdn(m) sde(m) sdu(m)\n"
+    b"2020/05/17 10:11:12.250 52.1 13.1 140.1 1 12 0.01 0.01 0.02\n"
+    b"2106 36674.25 52.1 13.2 140.1 1 12 0.01 0.01 0.02\n"
+)
 MRK = (
     b"1\t348585.1\t[2043]\t   -11,N\t    2,E\t   190,V\t52.1,Lat\t13.1,Lon\t100.1,Ellh\t"
     b"0.011, 0.010, 0.022\t50,Q\n"
@@ -650,7 +663,8 @@ TARGETS = {
     "exif": Target(_exif_only, lambda: [_exif()[6:]], "exif"),
     "xmp": Target(_xmp_only, lambda: [XMP], "xmp"),
     "geo_txt": Target(_positions(".txt"), lambda: [GEO], "geo_txt"),
-    "csv": Target(_positions(".csv"), lambda: [CSV], "csv"),
+    "csv": Target(_positions(".csv"), lambda: [CSV, TABLE, DEGREES, BARE], "csv"),
+    "pos": Target(_positions(".pos"), lambda: [POS], "pos"),
     "mrk": Target(_positions(".MRK"), lambda: [MRK], "mrk"),
     "srt": Target(_positions(".srt"), lambda: [SRT], "srt"),
     "gcp_list": Target(

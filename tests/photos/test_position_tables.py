@@ -61,6 +61,9 @@ FILES = {
     ).replace(",JPG", ".JPG"),
     "spanish.csv": f"Nombre,Latitud,Longitud,Altitud\n{NAME},{LAT},{LON},{HEIGHT}\n",
     "minutes.csv": f"name;lat;lon;alt\n{NAME};{N};{W};{HEIGHT} m\n",
+    "commas.csv": f"name;lat;lon;alt\n{NAME};{N};{W};{HEIGHT} m\n".replace(".", ",").replace(
+        ",JPG", ".JPG"
+    ),
     "hemispheres.tsv": f"name\tlat\tlon\talt\n{NAME}\tN {LAT}\t{-LON} W\t{HEIGHT}\n",
     "utm.csv": f"EPSG:32615\nname,easting,northing,height\n{NAME},{EAST},{NORTH},{HEIGHT}\n",
     "text.txt": f"name,lat,lon,alt\n{NAME},{LAT},{LON},{HEIGHT}\n",
@@ -132,6 +135,7 @@ def test_what_is_not_understood_is_told(tmp_path, photo, name, text, words):
         ("46.5", "latitude", 46.5),
         ("-46.5", "latitude", -46.5),
         ("46°30'S", "latitude", -46.5),
+        ("46°30'36,00\"N", "latitude", 46.51),
         ("46 deg 30' 36.00\" N", "latitude", 46.51),
         ("W 9°15'", "longitude", -9.25),
         ("9d15m36sE", "longitude", 9.26),

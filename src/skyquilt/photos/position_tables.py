@@ -113,7 +113,7 @@ _DEGREES = re.compile(
     re.IGNORECASE | re.ASCII,
 )
 _HEIGHT = re.compile(
-    r"([-+]?\d{1,6}(?:\.\d{1,15})?)\s*m(?:etres?|eters?)?(\s+(?:above|below) sea level)?",
+    r"([-+]?\d{1,6}(?:[.,]\d{1,15})?)\s*m(?:etres?|eters?)?(\s+(?:above|below) sea level)?",
     re.IGNORECASE | re.ASCII,
 )
 
@@ -359,7 +359,9 @@ def _cell(cells: list[str], column: int, field: str, place: str) -> float | None
     if value is None and field in ("latitude", "longitude"):
         value = degrees_of(text, field)
     elif value is None and (found := _HEIGHT.fullmatch(text)):
-        value = float(found[1]) * (-1 if "below" in (found[2] or "").lower() else 1)
+        value = float(found[1].replace(",", ".")) * (
+            -1 if "below" in (found[2] or "").lower() else 1
+        )
     if value is None:
         raise SideFileError(
             f"{place}: expected a number for {field}, found '{plain(text, 60)}'. Correct that cell."
@@ -392,7 +394,7 @@ def degrees_of(text: str, axis: str) -> float | None:
     """Degrees from `46°35'59.1"N`, `46 deg 35' 59.1" N`, `46°35.98'N`, `N 46.5`; None for anything
     else. `axis`: `latitude` or `longitude`.
     """
-    found = _DEGREES.fullmatch(text.strip())
+    found = _DEGREES.fullmatch(text.strip().replace(",", "."))
     if found is None or (found[1] and found[6]):
         return None
     side = (found[1] or found[6] or "").upper()
