@@ -95,6 +95,17 @@ def test_structures_of_skydio(make_jpeg, form):
     assert (place.takeoff_m, place.sigma_xy_m < 2) == (30.25, True)
 
 
+def test_names_of_yuneec(make_jpeg):
+    names = {"AboveHomeAltitude": "34.4", "GimbalYaw": "73.230003", "GimbalPitch": "-89.00000"}
+    names |= {"GimbalRoll": "0.000000", "DroneYaw": "96.699997", "DronePitch": "-3.72"}
+    told = " ".join(f'drone-yuneec:{name}="{value}"' for name, value in names.items())
+    uri = 'xmlns:drone-yuneec="http://www.yuneec.com/drone-yuneec/1.0/"'
+    photo = read_photo(make_jpeg(exif=dji_exif(), xmp=packet("", f"{uri} {told}")))
+    assert angles(photo) == pytest.approx((73.230003, 1, 0), abs=1e-6)
+    assert (photo.flight_yaw_deg, photo.flight_tilt_deg) == (96.699997, (-3.72, 0))
+    assert (photo.position.takeoff_m, photo.position.datum) == (34.4, "takeoff")
+
+
 @pytest.mark.parametrize("zero", ["0/100", "0.000000"])
 def test_camera_angles_that_are_all_zero_were_not_measured(make_jpeg, zero):
     """FLIR's cameras for drones write them where no autopilot is connected."""

@@ -145,7 +145,8 @@ def _heights(
         written = -written
     absolute = xmp.number("AbsoluteAltitude")
     absolute = _sane(absolute if absolute is not None else written, "altitude", notes)
-    takeoff = _sane(xmp.number("RelativeAltitude"), "height above take-off", notes, _ABOVE_TAKEOFF)
+    above = xmp.number("RelativeAltitude", "drone-yuneec:AboveHomeAltitude")
+    takeoff = _sane(above, "height above take-off", notes, _ABOVE_TAKEOFF)
     if _is_rtk(xmp):
         return takeoff, None, absolute
     return takeoff, absolute, None
@@ -212,6 +213,7 @@ _GIMBAL = (
     ("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree"),
     ("CameraYawDegree", "CameraPitchDegree", "CameraRollDegree"),
     tuple(f"CameraOrientationNED.{angle}" for angle in ("Yaw", "Pitch", "Roll")),
+    tuple(f"drone-yuneec:Gimbal{angle}" for angle in ("Yaw", "Pitch", "Roll")),
 )
 _LOOKS_DOWN_AT_MINUS_90 = -45.0
 _MOST_DEG = 720.0
@@ -222,11 +224,12 @@ _LOOKS_UP_DEG = 80.0
 def read_attitude(xmp: Xmp) -> tuple[Attitude | None, tuple[str, ...]]:
     """Belly angles, or None, with sentences on what is missing.
 
-    `Gimbal*Degree` (DJI, Autel), `drone-parrot:Camera*Degree` and Skydio's `CameraOrientationNED`
-    are gimbal angles (pitch -90 = nadir). Pix4D's `Camera:Yaw/Pitch/Roll` (senseFly, Parrot
-    Sequoia, MicaSense, older Autels) are belly angles: pitch 0 = nadir. Some files contain -90
-    there for nadir and are read as gimbal angles, because no survey camera looks backwards to the
-    horizon. Angles that are all zero were not measured; a pitch of +90 is taken for -90.
+    `Gimbal*Degree` (DJI, Autel), `drone-parrot:Camera*Degree`, Skydio's `CameraOrientationNED` and
+    `drone-yuneec:Gimbal*` are gimbal angles (pitch -90 = nadir). Pix4D's `Camera:Yaw/Pitch/Roll`
+    (senseFly, Parrot Sequoia, MicaSense, older Autels) are belly angles: pitch 0 = nadir. Some
+    files contain -90 there for nadir and are read as gimbal angles, because no survey camera looks
+    backwards to the horizon. Angles that are all zero were not measured; a pitch of +90 is taken
+    for -90.
     """
     for names in _GIMBAL:
         yaw, pitch, roll = (xmp.number(name) for name in names)
@@ -268,7 +271,7 @@ def read_flight_yaw(xmp: Xmp) -> tuple[float | None, tuple[str, ...]]:
     """Heading of the aircraft in degrees clockwise from north, or None, with a sentence where it is
     implausible.
     """
-    yaw = xmp.number("FlightYawDegree", "DroneYawDegree")
+    yaw = xmp.number("FlightYawDegree", "DroneYawDegree", "drone-yuneec:DroneYaw")
     if yaw is None or abs(yaw) <= _MOST_DEG:
         return yaw, ()
     return None, (f"A flight yaw of {yaw:g} degrees is not possible; it is ignored.",)
@@ -291,7 +294,10 @@ _FASTEST = 100.0
 
 def read_flight_tilt(xmp: Xmp) -> tuple[float, float]:
     """Pitch and roll of the aircraft in degrees; 0 where they are absent or impossible."""
-    pitch, roll = (xmp.number(f"Flight{axis}Degree") or 0.0 for axis in ("Pitch", "Roll"))
+    pitch, roll = (
+        xmp.number(f"Flight{axis}Degree", f"Drone{axis}Degree", f"drone-yuneec:Drone{axis}") or 0.0
+        for axis in ("Pitch", "Roll")
+    )
     return (pitch, roll) if max(abs(pitch), abs(roll)) <= _MOST_DEG else (0.0, 0.0)
 
 
