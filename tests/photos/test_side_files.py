@@ -102,6 +102,9 @@ def test_names_are_found_by_path_name_or_stem_but_never_guessed():
     assert names.find("x2") == "b/x2.JPG"
     assert names.find("x1.JPG") is None
     assert names.find("C:\\flights\\x2.jpg") == "b/x2.JPG"
+    assert names.find("C:\\flights\\B\\x1.jpg") == "b/x1.JPG"
+    assert names.find("./photos/a/x1.JPG") == "a/x1.JPG"
+    assert names.find("/ab/x1.JPG") is None
 
 
 GCP = """WGS84 UTM 15N

@@ -24,6 +24,8 @@ _ALTITUDE = (-12_000.0, 100_000.0)
 """Heights in m that are taken."""
 _MOST_ANGLE = 100_000.0
 _MOST_CRS = 20_000
+_MOST_PARTS = 30
+"""Number of folders in a path that are looked at."""
 _DECIMAL_COMMA = re.compile(r"[-+]?[0-9]{1,15},[0-9]{1,20}")
 
 
@@ -50,8 +52,8 @@ class SideRow:
 
 
 class PhotoNames:
-    """Finds the photo that a side file refers to: by path, by file name, or by name without ending,
-    ignoring case.
+    """Finds the photo that a side file refers to: by its path or the end of one, by file name, or
+    by name without ending, ignoring case.
     """
 
     def __init__(self, names: Iterable[str]) -> None:
@@ -64,7 +66,9 @@ class PhotoNames:
     def find(self, written: str) -> str | None:
         """The one photo that matches; None where there is none or several match."""
         path = PurePosixPath(written.strip().replace("\\", "/").lower())
-        for key in (str(path), path.name, path.stem):
+        # a path may begin above the folder of the photos: D:/flights/card 2/DJI_0001.JPG
+        ends = ["/".join(path.parts[k:]) for k in range(min(len(path.parts), _MOST_PARTS))]
+        for key in (*ends, path.name, path.stem):
             found = self._by_key.get(key, [])
             if len(found) == 1:
                 return found[0]
