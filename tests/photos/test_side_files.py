@@ -224,6 +224,21 @@ def test_shots_of_a_flight_are_not_given_to_another(tmp_path, make_jpeg):
     assert [p.position.latitude_deg for p in after] == [pytest.approx(46.2), pytest.approx(46.1)]
 
 
+def test_names_that_two_cards_share_are_told(tmp_path, make_jpeg):
+    photos = flights(make_jpeg, "a/DJI_0001.JPG", "b/DJI_0001.JPG", "b/DJI_0002.JPG")
+    side = written(tmp_path, "EPSG:4326\nDJI_0001.JPG -92 46.501\n")
+    with pytest.raises(SideFileError, match=r"several photos are called that \(a/DJI_0001.JPG, b/"):
+        apply_positions(photos, side)
+    side = written(tmp_path, "EPSG:4326\nDJI_0001.JPG -92 46.501\nDJI_0002.JPG -92 46.502\n")
+    (after, notes) = apply_positions(photos, side)
+    assert after[2].position.latitude_deg == pytest.approx(46.502)
+    assert after[0].position == photos[0].position
+    assert any("several photos are called that" in n for n in notes)
+    side = written(tmp_path, "EPSG:4326\nD:\\x\\b\\DJI_0001.JPG -92 46.503\n")
+    (after, _) = apply_positions(photos, side)
+    assert after[1].position.latitude_deg == pytest.approx(46.503)
+
+
 def test_photos_of_one_shot_in_several_bands_have_its_place(tmp_path, make_jpeg):
     photos = flights(make_jpeg, "DJI_0001_W.JPG", "DJI_0001_T.JPG")
     (after, _) = apply_positions(photos, written(tmp_path, MRK, "t.MRK"))

@@ -65,14 +65,16 @@ class PhotoNames:
 
     def find(self, written: str) -> str | None:
         """The one photo that matches; None where there is none or several match."""
+        found = self.all_of(written)
+        return found[0] if len(found) == 1 else None
+
+    def all_of(self, written: str) -> list[str]:
+        """The one photo that matches, else all of that name."""
         path = PurePosixPath(written.strip().replace("\\", "/").lower())
         # a path may begin above the folder of the photos: D:/flights/card 2/DJI_0001.JPG
         ends = ["/".join(path.parts[k:]) for k in range(min(len(path.parts), _MOST_PARTS))]
-        for key in (*ends, path.name, path.stem):
-            found = self._by_key.get(key, [])
-            if len(found) == 1:
-                return found[0]
-        return None
+        matches = [self._by_key.get(key, []) for key in (*ends, path.name, path.stem)]
+        return next((m for m in matches if len(m) == 1), next((m for m in matches if m), []))
 
 
 def of_one_flight(
@@ -140,8 +142,17 @@ def apply_rows(
             raise SideFileError(
                 f"{file.name} has two rows for {plain(photo, 80)} that differ. Remove one of them."
             )
-    strangers = [row.name for row in rows if names.find(row.name) is None]
-    if rows and len(strangers) == len(rows):
+    twins = [row.name for row in rows if len(names.all_of(row.name)) > 1]
+    alike = (
+        f"{file.name} names {sentence_of(twins)}, and several photos are called that"
+        f" ({sentence_of(names.all_of(twins[0]))}): write names with their folders and endings."
+        if twins
+        else ""
+    )
+    strangers = [row.name for row in rows if not names.all_of(row.name)]
+    if rows and len(twins) + len(strangers) == len(rows):
+        if alike:
+            raise SideFileError(alike)
         raise SideFileError(
             f"{file.name} names {sentence_of(strangers)}; none of the {len(photos)} photos is"
             " called that "
@@ -164,6 +175,7 @@ def apply_rows(
         f"{file.name} gave {turned} of {len(photos)} photos their angles, and placed none."
         if not placed
         else "",
+        alike,
         f"{file.name} names photos that are not in the survey: {sentence_of(strangers)}."
         if strangers
         else "",
