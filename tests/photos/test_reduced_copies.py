@@ -6,7 +6,7 @@ from datetime import datetime
 import pytest
 
 from skyquilt.model.photo import GeoPosition
-from skyquilt.photos.left_out import without_maps, without_reduced
+from skyquilt.photos.left_out import without_maps, without_panoramas, without_reduced
 from tests.alignment.surveys import photo
 
 
@@ -120,3 +120,25 @@ def test_maps_are_left_out_but_not_where_all_files_are_placed():
     kept, out = without_maps([*FULL, *maps])
     assert list(kept) == FULL and {r.name for r in out} == {"old.tif", "dsm.tif"}
     assert without_maps(maps) == (tuple(maps), ())
+
+
+PANORAMA = taken("PANO0001.JPG", 2, width=8000, height=4000)
+
+
+@pytest.mark.parametrize(
+    ("more", "out"),
+    [
+        ([PANORAMA], ["PANO0001.JPG"]),
+        ([taken("cut.jpg", 2, width=3000, height=1500)], []),  # a part of a photo is smaller
+        ([replace(PANORAMA, height=4001)], []),
+        ([replace(PANORAMA, name=f"{k}.jpg") for k in range(2)], []),  # too many for exceptions
+    ],
+)
+def test_panoramas_are_told_by_their_shape(more, out):
+    kept, gone = without_panoramas([*FULL, *more])
+    assert [r.name for r in gone] == out
+    assert len(kept) + len(gone) == len(FULL) + len(more)
+
+
+def test_a_survey_of_that_shape_stays():
+    assert without_panoramas([PANORAMA])[1] == ()

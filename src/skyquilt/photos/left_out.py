@@ -32,6 +32,12 @@ ROUNDED_DEG = 1e-5
 """Latitudes and longitudes of a photo and its copy differ by less than this."""
 IS_MAP = "it is a map (a GeoTIFF, placed on the ground), not a photo"
 """The reason recorded for a map among photos."""
+IS_PANORAMA = (
+    "it is a panorama by its shape (twice as wide as high, and larger than the photos), joined from"
+    " several photos"
+)
+_FEW = 0.25
+"""Share of the photos up to which pictures of that shape are exceptions."""
 PREFERRED = ("green", "red")
 """Bands that are shown before others of as many photos: lawns, fields and roads differ in them."""
 
@@ -86,6 +92,24 @@ def without_maps(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[Reje
         return tuple(photos), ()
     maps = tuple(RejectedPhoto(name=p.name, reason=IS_MAP) for p in photos if p.placed)
     return tuple(p for p in photos if not p.placed), maps
+
+
+def without_panoramas(
+    photos: Sequence[Photo],
+) -> tuple[tuple[Photo, ...], tuple[RejectedPhoto, ...]]:
+    """The photos without panoramas all around, whose metadata do not say what they are, and these:
+    a few pictures exactly twice as wide as high, as no sensor of a survey's camera is, and wider
+    than all photos, which parts cut out of photos are not.
+    """
+    others = [p for p in photos if p.width != 2 * p.height]
+    widest = max((max(p.width, p.height) for p in others), default=0)
+    round_ = {p.name for p in photos if p.width == 2 * p.height and p.width > widest}
+    if not round_ or len(round_) > _FEW * len(others):
+        return tuple(photos), ()
+    kept = tuple(p for p in photos if p.name not in round_)
+    return kept, tuple(
+        RejectedPhoto(name=p.name, reason=IS_PANORAMA) for p in photos if p.name in round_
+    )
 
 
 def without_reduced(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[RejectedPhoto, ...]]:

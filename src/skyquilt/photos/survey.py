@@ -32,6 +32,7 @@ from skyquilt.photos.left_out import (
     paths_of,
     without_copies,
     without_maps,
+    without_panoramas,
     without_reduced,
 )
 from skyquilt.photos.metadata import INVALID, NO_HEMISPHERE
@@ -185,6 +186,7 @@ def read_survey(
     rejected += more_rejected
     photos, copies = without_copies(p for p in files if isinstance(p, Photo))
     photos, maps = without_maps(photos)
+    photos, round_ = without_panoramas(photos)
     photos, reduced = without_reduced(photos)
     if not photos and not films:
         raise NoPhotosError(nothing_sentence(folder, found, rejected, clips=clips))
@@ -199,7 +201,9 @@ def read_survey(
     photos, implausible = placed_plausibly(photos)
     return Survey(
         photos=photos,
-        rejected=tuple(sorted((*rejected, *copies, *maps, *reduced), key=lambda r: r.name)),
+        rejected=tuple(
+            sorted((*rejected, *copies, *maps, *round_, *reduced), key=lambda r: r.name)
+        ),
         ignored=found.ignored
         if clips
         else tuple(sorted((*found.ignored, *(n for n, _ in found.clips)))),
