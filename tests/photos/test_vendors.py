@@ -86,13 +86,15 @@ def test_structures_of_skydio(make_jpeg, form):
         + structure("CalibratedOpticalCenter", X="49.5", Y="31")
         + "<s:Latitude>32.5189351</s:Latitude><s:Longitude>-110.9245471</s:Longitude>"
         + "<s:RelativeAltitude>30.25</s:RelativeAltitude>"
+        + "<s:GpsHorizontalAccuracy>0.71</s:GpsHorizontalAccuracy>"
+        + "<s:GpsVerticalAccuracy>1.25</s:GpsVerticalAccuracy>"
     )
     photo = read_photo(make_jpeg(xmp=packet(inside, SKYDIO)))
     assert angles(photo) == pytest.approx((127.44, 4.5, 0), abs=1e-9)
     assert (photo.calibration.focal, photo.calibration.cx) == (70.5, 49)
     place = photo.position
     assert (place.latitude_deg, place.longitude_deg) == (32.5189351, -110.9245471)
-    assert (place.takeoff_m, place.sigma_xy_m < 2) == (30.25, True)
+    assert (place.takeoff_m, place.sigma_xy_m, place.sigma_z_m) == (30.25, 0.71, 1.25)
 
 
 def test_names_of_yuneec(make_jpeg):

@@ -200,8 +200,8 @@ def _sigmas(exif: Exif, xmp: Xmp, notes: list[str], *, drone: bool) -> tuple[flo
         return None
 
     error = said(as_number(exif.gps.get(tag.GPS_ERROR)))
-    xy = said(xmp.number("Camera:GPSXYAccuracy", "GPSXYAccuracy")) or error or xy
-    z = said(xmp.number("Camera:GPSZAccuracy", "GPSZAccuracy")) or z
+    xy = said(xmp.number(*_ACCURACIES[0])) or error or xy
+    z = said(xmp.number(*_ACCURACIES[1])) or z
     if xmp.number("RtkFlag") in (_RTK_FLOAT, _RTK_FIXED):
         east, north, up = (said(xmp.number(f"RtkStd{axis}")) for axis in ("Lon", "Lat", "Hgt"))
         xy = max(east or 0.0, north or 0.0) or xy
@@ -209,6 +209,11 @@ def _sigmas(exif: Exif, xmp: Xmp, notes: list[str], *, drone: bool) -> tuple[flo
     return max(xy, 0.01), max(z, 0.01)
 
 
+_ACCURACIES = (
+    ("Camera:GPSXYAccuracy", "GPSXYAccuracy", "drone-skydio:GpsHorizontalAccuracy"),
+    ("Camera:GPSZAccuracy", "GPSZAccuracy", "drone-skydio:GpsVerticalAccuracy"),
+)
+"""Names of deviations in m, horizontal and vertical."""
 _GIMBAL = (
     ("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree"),
     ("CameraYawDegree", "CameraPitchDegree", "CameraRollDegree"),
