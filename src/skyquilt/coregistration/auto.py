@@ -52,7 +52,7 @@ class Auto:
     """
     sure: float = 6.0
     """Agreement above which nothing else is tried."""
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
 
     def __call__(self, a: Picture, b: Picture, guess: Guess | None = None) -> Outcome:
         """The registration of b to a, or the reason why there is none.

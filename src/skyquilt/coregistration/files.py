@@ -24,9 +24,21 @@ from skyquilt.model.photo import RejectedPhoto
 from skyquilt.model.registration import Matrix, RefusedRegistration, Registration
 from skyquilt.raster.atomic import whole_file, write_text
 from skyquilt.raster.cog import Block, CogWriter
+from skyquilt.raster.read_map import MapFile
 from skyquilt.raster.spec import RasterSpec
 
-_TYPES = {"uint8": "Byte", "uint16": "UInt16", "float32": "Float32"}
+_TYPES = {
+    "uint8": "Byte",
+    "int8": "Int8",
+    "uint16": "UInt16",
+    "int16": "Int16",
+    "uint32": "UInt32",
+    "int32": "Int32",
+    "uint64": "UInt64",
+    "int64": "Int64",
+    "float32": "Float32",
+    "float64": "Float64",
+}
 _COLOURS = ("Red", "Green", "Blue")
 
 
@@ -39,17 +51,21 @@ def vrt(
     px: NDArray[Any],
     ground: NDArray[Any],
     crs: str | None,
+    place: MapFile | None = None,
 ) -> str:
     """XML of a raster of `size` (width, height) whose pixels are those of `source`.
 
     px (n, 2) are columns and rows counted from the outer corner, ground (n, 2) x and y of `crs` (or
-    pixels of another image, if None).
+    pixels of another image, if None); place: what a map says of its values.
     """
     points = "\n".join(
         f'    <GCP Id="{k}" Pixel="{p[0]:.4f}" Line="{p[1]:.4f}" X="{g[0]:.9f}" Y="{g[1]:.9f}"/>'
         for k, (p, g) in enumerate(zip(px, ground, strict=True), 1)
     )
-    body = "\n".join(_band(source, k, bands, _TYPES[dtype]) for k in range(1, bands + 1))
+    said = _said(place) if place else ""
+    body = "\n".join(_band(source, k, bands, _TYPES[dtype], said) for k in range(1, bands + 1))
+    if place and place.masked and place.nodata is None:
+        body += "\n  <MaskBand>\n" + _band(source, "mask,1", 1, "Byte", "") + "\n  </MaskBand>"
     return (
         f'<VRTDataset rasterXSize="{size[0]}" rasterYSize="{size[1]}">\n'
         f"  <GCPList Projection={quoteattr(crs or '')}>\n{points}\n "
@@ -57,13 +73,31 @@ def vrt(
     )
 
 
-def _band(source: Path, number: int, bands: int, kind: str) -> str:
-    colour = f"    <ColorInterp>{_COLOURS[number - 1]}</ColorInterp>\n" if bands == 3 else ""
+def _band(source: Path, number: int | str, bands: int, kind: str, said: str) -> str:
+    colour = f"    <ColorInterp>{_COLOURS[int(number) - 1]}</ColorInterp>\n" if bands == 3 else ""
+    named = f' band="{number}"' if isinstance(number, int) else ""
     return (
-        f'  <VRTRasterBand dataType="{kind}" band="{number}">\n{colour}    <SimpleSource>\n'
+        f'  <VRTRasterBand dataType="{kind}"{named}>\n{said}{colour}    <SimpleSource>\n'
         f'      <SourceFilename relativeToVRT="0">{escape(str(source))}</SourceFilename>\n'
         f"      <SourceBand>{number}</SourceBand>\n    </SimpleSource>\n  </VRTRasterBand>"
     )
+
+
+def _said(place: MapFile) -> str:
+    """What every band of a map says of its values."""
+    lines = []
+    if place.nodata is not None:
+        lines.append(f"<NoDataValue>{place.nodata!r}</NoDataValue>")
+    if place.unit:
+        lines.append(f"<UnitType>{escape(place.unit)}</UnitType>")
+    if place.scale != (1.0, 0.0):
+        lines += [f"<Offset>{place.scale[1]!r}</Offset>", f"<Scale>{place.scale[0]!r}</Scale>"]
+    if place.palette is not None:
+        rows = (
+            '<Entry c1="{}" c2="{}" c3="{}" c4="{}"/>'.format(*c) for c in place.palette.tolist()
+        )
+        lines += ["<ColorInterp>Palette</ColorInterp>", f"<ColorTable>{''.join(rows)}</ColorTable>"]
+    return "".join(f"    {line}\n" for line in lines)
 
 
 OVERLAYS = ("side_by_side.png", "checkerboard.png", "false_colour.png", "alpha.png")
@@ -280,12 +314,16 @@ def _vrt(a: Source, b: Source, b_H_a: Matrix) -> str:
         m[0] * px_a[:, 0] + m[1] * px_a[:, 1] + m[2], m[3] * px_a[:, 0] + m[4] * px_a[:, 1] + m[5]
     ]
     values = b.picture.values
+    bands, dtype = 3 if values.ndim == 3 else 1, values.dtype.name
+    if b.place:  # as in the file, not as read
+        bands, dtype = b.place.stored_bands, b.place.stored
     return vrt(
         b.path.resolve(),
         size=(b.width, b.height),
-        bands=3 if values.ndim == 3 else 1,
-        dtype=values.dtype.name,
+        bands=bands,
+        dtype=dtype,
         px=px_b + 0.5,
         ground=ground,
         crs=a.place.crs if a.place else None,
+        place=b.place,
     )

@@ -37,7 +37,7 @@ class Usable:
     """An image as one band of real numbers."""
 
     grey: NDArray[np.float32]
-    """(H, W), no gaps: 0 where invalid."""
+    """(H, W), no gaps: where nothing was measured, the nearest value that was."""
     valid: NDArray[np.bool_]
     """(H, W) valid pixels."""
     reason: str = ""
@@ -54,8 +54,8 @@ def usable(picture: Picture) -> Usable:
     """
     band = one_band(picture.values)
     finite = np.isfinite(band)
-    grey = np.where(finite, band, 0).astype(np.float32)
     given = finite if picture.valid is None else finite & picture.valid
+    grey = filled(np.where(finite, band, 0).astype(np.float32), given)
     slack = _slack(grey[given]) if picture.values.dtype == np.uint8 and given.any() else 0.0
     valid = given & ~_bars(grey, slack) & ~_frame(grey, given, slack)
     return Usable(grey=grey, valid=valid, reason=_reason(grey, valid))
@@ -68,6 +68,23 @@ def one_band(values: NDArray[Any]) -> NDArray[np.float32]:
     if values.shape[2] == 3:
         return np.asarray(cv2.cvtColor(values.astype(np.float32), cv2.COLOR_RGB2GRAY))
     return np.asarray(values.mean(2, dtype=np.float32))
+
+
+def filled(grey: NDArray[np.float32], given: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """The image (H, W) with the nearest given value wherever none is given (0 if none is at all).
+    What stands there in a file may be anything (-9999, -3.4e38), and would be mixed into its
+    neighbours when the image is reduced and smoothed.
+    """
+    if given.all():
+        return grey
+    if not given.any():
+        return np.zeros_like(grey)
+    _, label = cv2.distanceTransformWithLabels(
+        (~given).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    values = np.zeros(label.max() + 1, np.float32)
+    values[label[given]] = grey[given]  # each given pixel has a label of its own
+    return np.asarray(values[label])
 
 
 def _slack(values: NDArray[np.float32]) -> float:

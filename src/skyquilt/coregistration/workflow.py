@@ -15,7 +15,7 @@ import numpy as np
 
 from skyquilt.coregistration.files import CONTRACT, draw, page
 from skyquilt.coregistration.methods import RegisterSettings, registration_method
-from skyquilt.coregistration.pictures import Source, guess_of, open_picture
+from skyquilt.coregistration.pictures import Source, common_parts, guess_of, open_picture
 from skyquilt.coregistration.stated_error import StatedError, state_error, tolerated
 from skyquilt.engine.clock import cpu_seconds
 from skyquilt.engine.folder import claimed
@@ -114,7 +114,7 @@ def outcome_of(a: Source, b: Source, method: str, guess: Guess | None) -> Outcom
         return outcome
     full_a, full_b = a.full_S_picture, b.full_S_picture
     matrix = full_b @ outcome.b_H_a @ np.linalg.inv(full_a)
-    error = outcome.error and outcome.error.moved(_factor(full_b), full_b[:2, 2])
+    error = outcome.error and outcome.error.seen_in(full_b)
     if _same(a, b):
         outcome = replace(
             outcome,
@@ -126,6 +126,18 @@ def outcome_of(a: Source, b: Source, method: str, guess: Guess | None) -> Outcom
     px_a, px_b = _scaled(outcome.px_a, full_a), _scaled(outcome.px_b, full_b)
     q = spread_quality(px_a, a.width, a.height, delta=0.1 * a.width)
     return replace(outcome, b_H_a=matrix / matrix[2, 2], px_a=px_a, px_b=px_b, q=q, error=error)
+
+
+def _of_files(a: Source, b: Source, method: str, guess: Guess | None) -> Outcome:
+    """The same of whole files; where a part of a large map is in the other one, the parts are
+    tried first, at their own resolution.
+    """
+    parts = common_parts(a, b) if guess is not None else None
+    if parts is not None and (near := guess_of(*parts)) is not None:
+        found = outcome_of(*parts, method, near)
+        if isinstance(found, Registration):
+            return found
+    return outcome_of(a, b, method, guess)
 
 
 def within_tolerance(
@@ -212,19 +224,16 @@ def _told(
     assert isinstance(a, Source) and isinstance(b, Source)
     guess = guess_of(a, b) if settings.use_metadata else None
     outcome, stated = within_tolerance(
-        outcome_of(a, b, settings.method, guess), a, b, settings.tolerance_px
+        _of_files(a, b, settings.method, guess), a, b, settings.tolerance_px
     )
     return _Told(outcome=outcome, stated=stated, guess=guess, cpu_s=cpu_seconds() - since)
 
 
-def _factor(full: np.ndarray) -> float:
-    """Px of a file per px of its picture; both axes differ by a rounding at most."""
-    return float(np.sqrt(full[0, 0] * full[1, 1]))
-
-
 def _same(a: Source, b: Source) -> bool:
     va, vb = a.picture.values, b.picture.values
-    return va.shape == vb.shape and np.array_equal(va, vb, equal_nan=va.dtype.kind == "f")
+    if va.shape != vb.shape or not np.array_equal(a.full_S_picture, b.full_S_picture):
+        return False
+    return np.array_equal(va, vb, equal_nan=va.dtype.kind == "f")
 
 
 def _scaled(px: np.ndarray, full: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """The registration of two images, or why it failed."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -84,25 +84,32 @@ class ErrorField:
     """(8, 8) of the parameters of `offsets`, px^2."""
     shared: float
     """Variance per axis of an error that is the same everywhere, px^2."""
+    full_S_own: Matrix = field(default_factory=lambda: np.eye(3))
+    """(3, 3) affine: from the px of b in which all this is, to those in which it is asked for."""
 
     def bound_px(self, px: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n,) distance in px of b within which the registration is right with 95 %, at px (n, 2)
         of b.
         """
-        J = offsets(np.asarray(px, np.float64), self.centre, self.unit)
-        (xx, xy), (_, yy) = np.einsum("nij,jk,nlk->iln", J, self.covariance, J)
+        linear, shift = self.full_S_own[:2, :2], self.full_S_own[:2, 2]
+        own = (np.asarray(px, np.float64) - shift) @ np.asarray(np.linalg.inv(linear).T, np.float64)
+        J = offsets(own, self.centre, self.unit)
+        every = np.einsum("nij,jk,nlk->nil", J, self.covariance, J) + self.shared * np.eye(2)
+        (xx, xy), (_, yy) = np.einsum("ai,nil,bl->abn", linear, every, linear)
         middle, half = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
-        along, across = middle + half + self.shared, np.maximum(middle - half, 0) + self.shared
+        along, across = middle + half, np.maximum(middle - half, 0)
         return np.asarray(np.sqrt(ALONG * along + (ROUND - ALONG) * across))
 
     def moved(self, scale: float, shift: NDArray[np.float64]) -> "ErrorField":
         """The same in other pixels of b: multiplied by a factor, then shifted."""
-        return ErrorField(
-            centre=scale * self.centre + shift,
-            unit=scale * self.unit,
-            covariance=scale**2 * self.covariance,
-            shared=scale**2 * self.shared,
-        )
+        x, y = shift
+        return self.seen_in(np.array([[scale, 0, x], [0, scale, y], [0, 0, 1.0]]))
+
+    def seen_in(self, full_S_these: Matrix) -> "ErrorField":
+        """The same in other pixels of b, to which an affine (3, 3) leads: mirrored, or with sides
+        of different length.
+        """
+        return replace(self, full_S_own=full_S_these @ self.full_S_own)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

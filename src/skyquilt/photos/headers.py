@@ -286,12 +286,18 @@ _OTHERS = {
     b"\xff\x0a": "a JPEG XL picture",
     b"\0\0\0\x0cJXL ": "a JPEG XL picture",
     b"\0\0\0\x0cjP  ": "a JPEG 2000 picture",
+    b"<VRTData": "a virtual raster (VRT), which names the files that hold its pixels",
+    b"\x89HDF": "a scientific data set (HDF5, NetCDF)",
+    b"CDF": "a scientific data set (NetCDF)",
+    b"SQLite f": "a database (GeoPackage or the like)",
     b"<": "a web page or other text",
     b"version ": "a pointer of Git LFS to a file that is not here",
     b"\0\x05\x16\x07": "macOS's notes on another file",
     b"\0" * 8: "empty (zeros), as of an interrupted copy",
 }
 """How files of other formats begin that are found under the name of a photo."""
+_DATA = ("its pixels", "NetCDF)", "the like)")
+"""How those end from which other programs can export a GeoTIFF."""
 _BOXES = {
     b"hei": "a HEIC picture",
     b"hev": "a HEIC picture",
@@ -324,6 +330,7 @@ def kind_of(head: bytes) -> Kind:
         known = _BOXES.get(head[8:11], "a video or HEIF picture")
     if known:
         saved = "; save it as JPEG, TIFF or PNG with its metadata" if "picture" in known else ""
+        saved = "; export its picture as a GeoTIFF" if known.endswith(_DATA) else saved
         raise UnreadablePhotoError(f"its content is {known}, whatever its name{saved}")
     raise UnreadablePhotoError("its content is neither JPEG, TIFF nor PNG, whatever its name")
 

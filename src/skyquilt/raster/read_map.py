@@ -3,12 +3,26 @@
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.raster.drivers import open_raster, why_unreadable
+from skyquilt.raster.placement import metres_per_unit, placement
+
+if TYPE_CHECKING:
+    from rasterio.io import DatasetReader
+
+FILLS = (-9999.0, -10000.0, -32767.0, -32768.0, -99999.0)
+"""Values with which programs fill pixels that have none, often without stating it."""
+LARGEST = 1e30
+"""Values beyond this are fillings, too."""
+_LOOKED = 1024
+"""Longer side in px at which a file is searched for values that may be fillings."""
+_FINER = 2
+"""Pixels per pixel that are read where values cannot be averaged by GDAL."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -22,15 +36,52 @@ class MapFile:
     height: int
     """Rows."""
     bands: int
-    """Number of image bands: 1 or 3; an alpha band is validity and does not count."""
-    dtype: str
-    """Type of its pixels."""
+    """Number of bands that are read: 1 or 3; an alpha band is validity and does not count."""
     affine: tuple[float, float, float, float, float, float]
     """(a, b, c, d, e, f): corner x = a col + b row + c, y = d col + e row + f."""
     crs: str | None
     """As WKT; None where the file states none."""
     unit: str = ""
     """Unit of the first band, where stated."""
+    stored: str = ""
+    """Type of the pixels in the file."""
+    stored_bands: int = 1
+    """Image bands in the file: 1 for a palette."""
+    scale: tuple[float, float] = (1.0, 0.0)
+    """Factor and offset that turn what is stored into values."""
+    palette: NDArray[np.uint8] | None = None
+    """(n, 4) RGBA of stored numbers, if these are no values."""
+    nodata: float | None = None
+    """Stored value of pixels without data; found in the pixels where the file states none."""
+    masked: bool = False
+    """Whether the file itself says which pixels have data."""
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether the file shows the ground as from below: rows from south to north, or columns
+        from east to west. Only a CRS of the Earth tells which way axes point.
+        """
+        a, b, _, d, e, _ = self.affine
+        return self.metres is not None and a * e - b * d > 0
+
+    @property
+    def metres(self) -> tuple[float, float] | None:
+        """Width and height of a pixel on the ground in m, at the middle of the map; None where
+        this is not known.
+        """
+        a, b, _, d, e, f = self.affine
+        per = metres_per_unit(self.crs, d * self.width / 2 + e * self.height / 2 + f)
+        if per is None:
+            return None
+        x, y = per
+        return float(np.hypot(a * x, d * y)), float(np.hypot(b * x, e * y))
+
+    @property
+    def aspect(self) -> float:
+        """Width of a pixel on the ground over its height, 1/8 to 8."""
+        a, b, _, d, e, _ = self.affine
+        wide, high = self.metres or (float(np.hypot(a, d)), float(np.hypot(b, e)))
+        return float(np.clip(wide / high, 1 / 8, 8))
 
 
 def open_map(path: Path) -> MapFile | None:
@@ -45,33 +96,96 @@ def open_map(path: Path) -> MapFile | None:
             warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
             raster = open_raster(path)
         with raster:
-            placed = raster.crs is not None or not raster.transform.is_identity
-            if not placed:
+            placed = placement(raster, path)
+            if placed is None:
                 return None
+            palette = _palette(raster)
+            stored = 3 if raster.count >= 3 else 1
             return MapFile(
                 path=path,
                 width=raster.width,
                 height=raster.height,
-                bands=3 if raster.count >= 3 else 1,
-                dtype=raster.dtypes[0],
-                affine=tuple(raster.transform)[:6],
+                bands=stored if palette is None else 3,
+                affine=placed.affine,
+                crs=placed.crs,
                 unit=raster.units[0] or "",
-                crs=raster.crs.to_wkt() if raster.crs else None,
+                stored=raster.dtypes[0],
+                stored_bands=stored,
+                scale=_scale(raster, stored),
+                palette=palette,
+                nodata=_nodata(raster),
+                masked=_masked(raster),
             )
-    except rasterio.errors.RasterioError:
+    except (rasterio.errors.RasterioError, UnicodeDecodeError):
         return None
+
+
+def _palette(raster: "DatasetReader") -> NDArray[np.uint8] | None:
+    if raster.count != 1 or raster.dtypes[0] not in ("uint8", "uint16"):
+        return None
+    try:
+        colours = raster.colormap(1)
+    except ValueError:
+        return None
+    table = np.zeros((max(colours) + 1, 4), np.uint8)
+    for number, rgba in colours.items():
+        table[number] = rgba
+    return table
+
+
+def _scale(raster: "DatasetReader", bands: int) -> tuple[float, float]:
+    """Those of all bands, if they are the same and mean anything."""
+    found = set(zip(raster.scales[:bands], raster.offsets[:bands], strict=True))
+    scale, offset = found.pop()
+    if found or not scale or not np.isfinite([scale, offset]).all():
+        return 1.0, 0.0
+    return float(scale), float(offset)
+
+
+def _masked(raster: "DatasetReader") -> bool:
+    from rasterio.enums import MaskFlags
+
+    return MaskFlags.all_valid not in raster.mask_flag_enums[0]
+
+
+def _nodata(raster: "DatasetReader") -> float | None:
+    """The stated value, or one of `FILLS` that occurs in the first band."""
+    import rasterio
+
+    if _masked(raster) or np.dtype(raster.dtypes[0]).kind not in "if":
+        return None if raster.nodata is None else float(raster.nodata)
+    factor = max(1.0, max(raster.width, raster.height) / _LOOKED)
+    shape = (max(1, round(raster.height / factor)), max(1, round(raster.width / factor)))
+    try:
+        seen = raster.read(1, out_shape=shape)
+    except rasterio.errors.RasterioError:
+        return None  # told when the pixels are read
+    low = float(np.nanmin(seen)) if not np.isnan(seen).all() else 0.0
+    return low if low in FILLS else None
 
 
 def read_reduced(source: MapFile, longest: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
     """Pixels (h, w[, 3]) and validity (h, w), averaged so that the longer side has at most
-    `longest` px.
+    `longest` px and that pixels are as wide on the ground as they are high.
 
     Raises:
-        OSError: the file's data are damaged.
+        OSError: the file's data are damaged, or are no measurements.
     """
-    scale = max(1.0, max(source.width, source.height) / longest)
-    shape = (max(1, round(source.height / scale)), max(1, round(source.width / scale)))
-    return _read(source, None, shape)
+    return read_part(source, (0, 0, source.height, source.width), longest)
+
+
+def read_part(
+    source: MapFile, part: tuple[int, int, int, int], longest: int
+) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """The same of a part (row, column, height, width) that lies inside the raster."""
+    from rasterio.windows import Window
+
+    row, column, height, width = part
+    aspect = source.aspect if abs(np.log(source.aspect)) > 0.01 else 1.0
+    rows, columns = height * min(1.0, 1 / aspect), width * min(1.0, aspect)
+    scale = max(1.0, max(rows, columns) / longest)
+    shape = (max(1, round(rows / scale)), max(1, round(columns / scale)))
+    return _read(source, Window(column, row, width, height), shape)
 
 
 def read_window(
@@ -80,7 +194,7 @@ def read_window(
     """Pixels (height, width[, 3]) and validity of a part that lies inside the raster.
 
     Raises:
-        OSError: the file's data are damaged.
+        OSError: the file's data are damaged, or are no measurements.
     """
     from rasterio.windows import Window
 
@@ -88,23 +202,56 @@ def read_window(
 
 
 def _read(
-    source: MapFile, window: object, shape: tuple[int, int]
+    source: MapFile, window: Any, shape: tuple[int, int]
 ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
     import rasterio
     from rasterio.enums import Resampling
 
+    if source.stored.startswith("complex"):
+        raise OSError("its pixels are complex numbers; make a map of their amounts first")
+    own = source.palette is not None or (source.nodata is not None and not source.masked)
+    full = (round(window.height), round(window.width))
+    finer = tuple(min(f, _FINER * s) for f, s in zip(full, shape, strict=True)) if own else shape
     try:
         with open_raster(source.path) as raster:
             values = raster.read(
-                list(range(1, source.bands + 1)),
+                list(range(1, source.stored_bands + 1)),
                 window=window,
-                out_shape=(source.bands, *shape),
-                resampling=Resampling.average,
+                out_shape=(source.stored_bands, *finer),
+                resampling=Resampling.nearest if own else Resampling.average,
             )
-            valid = raster.dataset_mask(window=window, out_shape=shape) > 0
+            valid = raster.dataset_mask(window=window, out_shape=finer) > 0
     except rasterio.errors.RasterioError as error:
         raise OSError(f"its pixels cannot be decoded: {why_unreadable(error)}") from error
+    if source.nodata is not None and not source.masked:
+        valid &= (values != source.nodata).all(0)
+    if source.palette is not None:
+        colours = source.palette[np.minimum(values[0], len(source.palette) - 1)]
+        valid &= colours[..., 3] > 0
+        values = np.moveaxis(colours[..., :3], -1, 0)
     pixels = np.moveaxis(values, 0, -1) if source.bands > 1 else values[0]
     if pixels.dtype.kind == "f":
-        valid &= np.isfinite(pixels if pixels.ndim == 2 else pixels.sum(2))
+        usual = np.abs(pixels) < LARGEST  # false where it is not a number
+        valid &= usual if pixels.ndim == 2 else usual.all(2)
+    if source.scale != (1.0, 0.0):
+        pixels = pixels * source.scale[0] + source.scale[1]
+    if pixels.dtype not in (np.uint8, np.uint16):
+        with np.errstate(over="ignore"):  # beyond the largest float32: not valid
+            pixels = pixels.astype(np.float32)
+    if finer != shape:
+        pixels, valid = _reduced(pixels, valid, shape)
     return np.ascontiguousarray(pixels), valid
+
+
+def _reduced(
+    pixels: NDArray[Any], valid: NDArray[np.bool_], shape: tuple[int, int]
+) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """Averages of valid pixels; valid where all are."""
+    size = (shape[1], shape[0])
+    share = cv2.resize(valid.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    wide = valid if pixels.ndim == 2 else valid[..., None]
+    sums = np.where(wide, pixels, 0).astype(np.float32)
+    means = cv2.resize(sums, size, interpolation=cv2.INTER_AREA)
+    if pixels.dtype.kind != "f":
+        means = np.rint(means)
+    return np.asarray(means.astype(pixels.dtype)), np.asarray(share > 0.999)

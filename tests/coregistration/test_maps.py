@@ -1,0 +1,350 @@
+"""Maps as other programs write them: types, missing data, places; against distortions made here."""
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+from pyproj import CRS, Transformer
+from rasterio.control import GroundControlPoint
+from rasterio.transform import Affine
+
+from skyquilt.coregistration.pictures import common_parts, guess_of, open_picture
+from skyquilt.coregistration.usable import filled, usable
+from skyquilt.coregistration.workflow import register
+from skyquilt.model.registration import ErrorField, Picture
+from tests.coregistration.scenes import error, layout, pair, spectrum, turned
+
+SHAPE = (400, 480)
+TRUTH = turned(0.95, 21.0, SHAPE, SHAPE, (6.0, -9.0))
+PLACE_A = Affine(0.5, 0, 500_000, 0, -0.5, 5_000_000)
+FLIP = np.array([[1, 0, 0], [0, -1, SHAPE[0] - 1], [0, 0, 1.0]])
+"""From the pixels of a picture to those of the same one with the last row first."""
+LOCAL = 'LOCAL_CS["site",UNIT["metre",1],AXIS["E",EAST],AXIS["N",NORTH]]'
+
+
+def corners_of(matrix):
+    """The affine in rasterio's pixels (corners at integers) of one whose centres are."""
+    half = Affine.translation(0.5, 0.5)
+    return half @ Affine(*matrix[:2].ravel()) @ ~half
+
+
+def place_b(b_H_a=TRUTH):
+    """Where b lies on the ground, if a lies at `PLACE_A`."""
+    return PLACE_A @ ~corners_of(b_H_a)
+
+
+def write(path, values, place, crs="EPSG:32633", mask=None, nodata=None, **more):
+    bands = values if values.ndim == 3 else values[None]
+    about = {"width": bands.shape[2], "height": bands.shape[1], "count": len(bands)} | more
+    about = {"driver": "GTiff", "dtype": bands.dtype, "crs": crs, "nodata": nodata} | about
+    if place is not None:
+        about["transform"] = place
+    with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), rasterio.open(path, "w", **about) as raster:
+        raster.write(bands)
+        if mask is not None:
+            raster.write_mask(mask)
+    return path
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """Path of a map, and b: 8 bits, 0 where a ends."""
+    folder = tmp_path_factory.mktemp("maps")
+    a, b = pair(TRUTH, seed=12)
+    rest = cv2.warpPerspective(np.ones(SHAPE, np.uint8), TRUTH, SHAPE[::-1]) == 0
+    b = np.maximum(b, 1)
+    b[cv2.dilate(rest.astype(np.uint8), np.ones((5, 5))) > 0] = 0
+    return write(folder / "a.tif", a, PLACE_A), b
+
+
+def typed(b, kind):
+    """b as values of a type, and what they mean (NaN: nothing); fills as other programs do."""
+    degrees = np.where(b == 0, np.nan, 10 + b / 10)
+    fill = {"float32": -9999, "float64": -3.4028234663852886e38, "int16": -32768, "uint32": 0}
+    fill |= {"int32": -99999}
+    factor = {"int16": 100, "int32": 100, "uint32": 1000}.get(kind, 1)
+    stored = np.where(b == 0, fill[kind], np.round(degrees * factor, 6)).astype(kind)
+    return stored, fill[kind], degrees * factor
+
+
+@pytest.mark.parametrize("kind", ["float64", "int16", "uint32"])
+def test_values_of_any_type_with_stated_fillings(scene, tmp_path, kind):
+    """int16 and others ended in a traceback, and -9999 and -3.4e38 ran into what lies beside."""
+    path, b = scene
+    stored, fill, meant = typed(b, kind)
+    write(tmp_path / "b.tif", stored, place_b(), nodata=fill)
+    record = register(path, tmp_path / "b.tif", tmp_path / "out").metrics
+    assert error(np.array(record["b_H_a"]), TRUTH) < 0.3
+    with rasterio.open(tmp_path / "out" / "b_on_a.tif") as raster:
+        found = raster.read(1)
+    lies = np.array(record["b_H_a"])
+    flags = cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR
+    expected = cv2.warpPerspective(
+        meant.astype(np.float32), lies, SHAPE[::-1], flags=flags, borderValue=float("nan")
+    )
+    both = np.isfinite(found) & np.isfinite(expected)
+    assert np.isfinite(found).sum() > 0.97 * np.isfinite(expected).sum()
+    # the grid of OpenCV's interpolation has steps of 1/32 px
+    assert np.percentile(np.abs(found - expected)[both], 99) < 0.05 * np.nanstd(expected)
+    with rasterio.open(tmp_path / "out" / "b.vrt") as raster:  # as stored
+        assert raster.dtypes == (kind,) and raster.nodata == fill
+        assert (raster.read(1) == stored).all()
+
+
+@pytest.mark.parametrize("kind", ["float32", "int16"])
+def test_fillings_that_the_file_does_not_state(scene, tmp_path, kind):
+    path, b = scene
+    stored, _, meant = typed(b, kind)
+    write(tmp_path / "b.tif", stored, place_b())
+    record = register(path, tmp_path / "b.tif", tmp_path / "out").metrics
+    assert error(np.array(record["b_H_a"]), TRUTH) < 0.3
+    with rasterio.open(tmp_path / "out" / "b_on_a.tif") as raster:
+        found = raster.read(1)
+    assert np.nanmin(meant) <= np.nanmin(found) and np.nanmax(found) <= np.nanmax(meant)
+
+
+def test_stored_numbers_with_a_scale_become_values(scene, tmp_path):
+    """They were written as they are stored, with the unit of the values."""
+    path, b = scene
+    write(tmp_path / "b.tif", b.astype(np.uint16) * 50, place_b(), nodata=0)
+    with rasterio.open(tmp_path / "b.tif", "r+") as raster:
+        raster.scales, raster.offsets = (0.02,), (-100.0,)
+        raster.set_band_unit(1, "degC")
+    register(path, tmp_path / "b.tif", tmp_path / "out")
+    with rasterio.open(tmp_path / "out" / "b_on_a.tif") as raster:
+        found = raster.read(1)
+        assert raster.units == ("degC",) and raster.scales == (1.0,)
+    assert -100 < np.nanmin(found) and np.nanmax(found) <= 155
+    assert np.nanmax(found) > b.max() - 100 - 15
+    with rasterio.open(tmp_path / "out" / "b.vrt") as raster:
+        assert (raster.scales, raster.offsets, raster.units) == ((0.02,), (-100.0,), ("degC",))
+
+
+def test_a_palette_is_read_as_its_colours(scene, tmp_path):
+    """Numbers of colours were interpolated."""
+    path, b = scene
+    order = np.random.default_rng(0).permutation(256)
+    write(tmp_path / "b.tif", order[b].astype(np.uint8), place_b())
+    colours = {int(order[k]): (k, 255 - k, k, 255 if k else 0) for k in range(256)}
+    with rasterio.open(tmp_path / "b.tif", "r+") as raster:
+        raster.write_colormap(1, colours)
+    record = register(path, tmp_path / "b.tif", tmp_path / "out").metrics
+    assert error(np.array(record["b_H_a"]), TRUTH) < 0.3
+    with rasterio.open(tmp_path / "out" / "b_on_a.tif") as raster:
+        red, green, blue = raster.read().astype(int)
+        seen = raster.dataset_mask() > 0
+    assert (np.abs(red + green - 255)[seen] <= 1).all() and (red == blue).all()
+    assert 0.5 < seen.mean() < 0.95
+    with rasterio.open(tmp_path / "out" / "b.vrt") as raster:
+        assert raster.colormap(1)[int(order[9])] == (9, 246, 9, 255)
+
+
+@pytest.mark.parametrize("how", ["mask", "alpha"])
+def test_masks_reach_both_outputs(scene, tmp_path, how):
+    path, b = scene
+    colours, seen = np.stack([b, b // 2 + 60, 255 - b]), np.where(b > 0, 255, 0).astype(np.uint8)
+    if how == "mask":
+        write(tmp_path / "b.tif", colours, place_b(), mask=seen)
+    else:
+        bands = np.concatenate([colours, seen[None]])
+        write(tmp_path / "b.tif", bands, place_b(), photometric="RGB", alpha="YES")
+    record = register(path, tmp_path / "b.tif", tmp_path / "out").metrics
+    assert error(np.array(record["b_H_a"]), TRUTH) < 0.3
+    with rasterio.open(tmp_path / "out" / "b.vrt") as raster:
+        assert raster.count == 3 and (raster.dataset_mask() == seen).all()
+    with rasterio.open(tmp_path / "out" / "b_on_a.tif") as raster:
+        values, mask = raster.read(), raster.dataset_mask() > 0
+    assert 0.5 < mask.mean() < 0.9 and values[2][mask].min() >= 255 - b.max()
+
+
+def test_complex_pixels_are_refused_in_a_sentence(scene, tmp_path):
+    path, b = scene
+    write(tmp_path / "b.tif", b.astype(np.complex64), place_b())
+    record = register(path, tmp_path / "b.tif", tmp_path / "out").metrics
+    assert "complex numbers" in record["reason"] and record["b_H_a"] is None
+
+
+def mirrored(values):
+    return np.ascontiguousarray(values[::-1])
+
+
+@pytest.mark.parametrize("which", ["a", "b"])
+def test_rows_from_south_to_north(scene, tmp_path, which):
+    """A map whose first row is its most southern one had been compared in the mirror."""
+    path, b = scene
+    truth, end, place = TRUTH, path, place_b()
+    upside_down = corners_of(FLIP)
+    if which != "b":
+        with rasterio.open(path) as raster:
+            values = raster.read(1)
+        end = write(tmp_path / "a.tif", mirrored(values), PLACE_A @ upside_down)
+        truth = truth @ FLIP
+    if which != "a":
+        b, place, truth = mirrored(b), place @ upside_down, FLIP @ truth
+    write(tmp_path / "b.tif", b, place, nodata=0)
+    record = register(end, tmp_path / "b.tif", tmp_path / "out").metrics
+    assert record["guess"] == "the places of both maps"
+    assert error(np.array(record["b_H_a"]), truth) < 0.3
+    with rasterio.open(end) as raster, rasterio.open(tmp_path / "out" / "b_on_a.tif") as moved:
+        assert moved.transform == raster.transform
+    with rasterio.open(tmp_path / "out" / "b.vrt") as raster:
+        points, _ = raster.gcps
+    for p in points[::7]:  # on the ground as the file itself places it
+        x, y = place @ (p.col, p.row)
+        assert np.hypot(p.x - x, p.y - y) < 0.3
+
+
+def ground_pair(crs, place, shape, b_H_a=None, seed=21):
+    """b (400, 480) of one ground as a map in another CRS, whose pixels may be longer than wide, and
+    b_H_a at nine points of a.
+    """
+    labels = layout(400, 480, seed=seed)
+    change = Transformer.from_crs(crs, "EPSG:32633", always_xy=True)
+    column, row = np.meshgrid(np.arange(shape[1]) + 0.5, np.arange(shape[0]) + 0.5)
+    x, y = change.transform(*(place @ (column, row)))
+    u, v = ~PLACE_A @ (x, y)
+    fine = cv2.GaussianBlur(spectrum(labels, seed + 1), (0, 0), 0.7)
+    b = cv2.remap(
+        fine, (u - 0.5).astype(np.float32), (v - 0.5).astype(np.float32), cv2.INTER_LINEAR
+    )
+    return np.clip(spectrum(labels, seed), 1, 255).astype(np.uint8), b
+
+
+def places_of(crs, place):
+    """Nine pixels of a, and where they lie in a map of another CRS."""
+    px = np.stack(np.meshgrid([60, 240, 420], [60, 200, 340]), -1).reshape(-1, 2).astype(float)
+    x, y = PLACE_A @ (px[:, 0] + 0.5, px[:, 1] + 0.5)
+    x, y = Transformer.from_crs("EPSG:32633", crs, always_xy=True).transform(x, y)
+    return px, np.stack(~place @ (np.asarray(x), np.asarray(y)), 1) - 0.5
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.02])
+def test_degrees_of_equal_size_are_not_as_wide_as_high(tmp_path, shift):
+    """What QGIS and gdalwarp write in EPSG:4326: at 45 degrees a pixel is 1.4 times as high as it
+    is wide. Where the place was no guess, nothing was found.
+    """
+    step = 0.5 / 95_000
+    lon, lat = Transformer.from_crs("EPSG:32633", 4326, always_xy=True).transform(
+        500_000, 5_000_000
+    )
+    place = Affine(step, 0, lon, 0, -step, lat)
+    shape = (int(200 / (111_195 * step)), int(240 / (78_850 * step)))
+    a, b = ground_pair("EPSG:4326", place, shape)
+    write(tmp_path / "a.tif", a, PLACE_A)
+    write(tmp_path / "b.tif", b, Affine.translation(shift, 0) @ place, "EPSG:4326")
+    record = register(tmp_path / "a.tif", tmp_path / "b.tif", tmp_path / "out").metrics
+    assert (record["guess"] is None) == bool(shift)
+    px, there = places_of("EPSG:4326", place)
+    found = np.c_[px, np.ones(9)] @ np.array(record["b_H_a"]).T
+    assert np.abs(found[:, :2] / found[:, 2:] - there).max() < 0.6
+
+
+def test_maps_of_a_local_system_or_of_none(scene, tmp_path):
+    """A local system beside one of the Earth ended in a traceback; one beside none is its own."""
+    path, b = scene
+    for crs, told in ((CRS.from_wkt(LOCAL).to_wkt(), False), (None, True), ("EPSG:32633", True)):
+        write(tmp_path / "b.tif", b, place_b(), crs, nodata=0)
+        record = register(path, tmp_path / "b.tif", tmp_path / "out", overwrite=True).metrics
+        assert (record["guess"] is not None) == told
+        assert error(np.array(record["b_H_a"]), TRUTH) < 0.3
+
+
+def test_control_points_in_the_file_are_its_place(scene, tmp_path):
+    path, b = scene
+    points = [
+        GroundControlPoint(row=r, col=c, x=x, y=y)
+        for r in (0, 200, 400)
+        for c in (0, 480)
+        for x, y in [place_b() @ (c, r)]
+    ]
+    write(tmp_path / "b.tif", b, None, gcps=points)
+    record = register(path, tmp_path / "b.tif", tmp_path / "out").metrics
+    assert record["guess"] == "the places of both maps"
+    assert error(np.array(record["b_H_a"]), TRUTH) < 0.3
+    opened = open_picture(tmp_path / "b.tif")
+    assert np.allclose(opened.place.affine, tuple(place_b())[:6], atol=1e-4)
+    points[2] = GroundControlPoint(row=0, col=480, x=points[2].x + 3, y=points[2].y)
+    write(tmp_path / "bent.tif", b, None, gcps=points)
+    assert open_picture(tmp_path / "bent.tif").place is None  # a plane would misplace it
+
+
+@pytest.mark.parametrize("name", ["b.png", "b.jp2", "b.img", "noname"])
+def test_maps_of_any_format_keep_their_place(scene, tmp_path, name):
+    path, b = scene
+    driver = {"b.png": "PNG", "b.jp2": "JP2OpenJPEG", "b.img": "HFA"}.get(name, "GTiff")
+    more = {"b.png": {"worldfile": "YES"}, "b.jp2": {"reversible": "YES", "quality": 100}}
+    step = Affine(0.5, 0, 500_003, 0, -0.5, 4_999_998)
+    write(tmp_path / name, b, step, driver=driver, **more.get(name, {}))
+    opened = open_picture(tmp_path / name)
+    assert opened.place is not None and opened.place.affine == tuple(step)[:6]
+    back = open_picture(path)
+    assert guess_of(back, opened).b_H_a == pytest.approx(
+        np.array([[1, 0, -6], [0, 1, -4], [0, 0, 1.0]])
+    )
+
+
+def test_a_world_file_and_the_projection_beside_it(scene, tmp_path):
+    """What most programs write beside a picture that they export."""
+    _, b = scene
+    cv2.imwrite(str(tmp_path / "b.jpg"), b)
+    (tmp_path / "b.jgw").write_text("0.5\n0\n0\n-0.5\n500003.25\n4999997.75\n")
+    opened = open_picture(tmp_path / "b.jpg")
+    assert opened.place.affine == (0.5, 0, 500_003, 0, -0.5, 4_999_998) and not opened.place.crs
+    (tmp_path / "b.prj").write_text(CRS("EPSG:32633").to_wkt("WKT1_ESRI"))
+    assert CRS(open_picture(tmp_path / "b.jpg").place.crs).equals(CRS("EPSG:32633"))
+
+
+def test_a_small_map_in_a_large_one_is_compared_at_its_own_size(tmp_path):
+    """A map of 6000 px was reduced to 2048, and the small one with it to a third."""
+    labels = layout(900, 1000, seed=5)
+    a = np.full((6000, 5000), 90, np.uint8)
+    a[3000:3900, 1200:2200] = np.clip(spectrum(labels, 1), 1, 255)
+    truth = np.array([[0.5, 0, -0.25 - 600 - 50], [0, 0.5, -0.25 - 1500 - 30], [0, 0, 1.0]])
+    size = (400, 380)
+    b = spectrum(labels, 2)
+    inside = truth @ np.array([[1, 0, 1200], [0, 1, 3000], [0, 0, 1.0]])
+    b = cv2.warpPerspective(cv2.GaussianBlur(b, (0, 0), 0.7), inside, size)
+    write(tmp_path / "a.tif", a, PLACE_A, tiled=True, compress="deflate")
+    place = Affine.translation(3, -2) @ place_b(truth)  # 3.6 m off
+    write(tmp_path / "b.tif", b, place)
+    one, other = open_picture(tmp_path / "a.tif"), open_picture(tmp_path / "b.tif")
+    parts = common_parts(one, other)
+    assert parts[0].picture.shape[0] < 1100 and parts[1].picture.shape == (380, 400)
+    middle = parts[0].full_S_picture @ [100, 100, 1]
+    x, y = (round(v) for v in middle[:2])
+    assert parts[0].picture.values[100, 100] == a[y, x]
+    record = register(tmp_path / "a.tif", tmp_path / "b.tif", tmp_path / "out").metrics
+    px = np.array([[1400, 3200, 1], [2000, 3300, 1], [1500, 3700, 1.0]])
+    found, right = px @ np.array(record["b_H_a"]).T, px @ truth.T
+    assert np.abs(found[:, :2] / found[:, 2:] - right[:, :2]).max() < 0.4
+
+
+def test_what_was_not_measured_has_the_nearest_value():
+    grey = np.add.outer(np.arange(8.0), 10 * np.arange(9.0)).astype(np.float32)
+    given = np.ones((8, 9), bool)
+    given[:, 5:] = given[6:] = False
+    found = filled(np.where(given, grey, np.float32(-3.4e38)), given)
+    assert (found[given] == grey[given]).all()
+    assert (found[:6, 5:] == grey[:6, 4:5]).all() and (found[6:, :5] == grey[5, :5]).all()
+    assert (filled(grey, np.zeros((8, 9), bool)) == 0).all()
+    band = np.where(np.arange(200) < 150, 20 + np.arange(200) % 37, -9999.0)
+    picture = Picture(values=np.tile(band, (100, 1)).astype(np.float32))
+    seen = usable(Picture(values=picture.values, valid=picture.values > -9999))
+    assert seen.grey.min() >= 20 and not seen.valid[:, 150:].any()
+
+
+def test_an_error_is_the_same_in_other_pixels():
+    """Mirrored, and with pixels half as wide: what is stated of a place is that of the same place,
+    in the new pixels: along x twice as much, along y as much.
+    """
+    rng = np.random.default_rng(3)
+    half = rng.normal(size=(8, 8))
+    field = ErrorField(centre=np.array([50.0, 40]), unit=60.0, covariance=half @ half.T, shared=0.2)
+    px = rng.uniform(0, 100, (40, 2))
+    other = field.seen_in(np.array([[1, 0, 0], [0, -1, 99], [0, 0, 1.0]]))
+    assert other.bound_px(px * [1, -1] + [0, 99]) == pytest.approx(field.bound_px(px))
+    scaled = field.moved(3.0, np.array([7.0, -2]))
+    assert scaled.bound_px(3 * px + [7, -2]) == pytest.approx(3 * field.bound_px(px))
+    wide = field.seen_in(np.diag([2.0, 1, 1])).bound_px(px * [2, 1])
+    assert (wide >= field.bound_px(px) - 1e-9).all()
+    assert (wide <= 2 * field.bound_px(px) + 1e-9).all()
