@@ -315,7 +315,7 @@ def _grid(part: tuple[int, int, int, int]) -> NDArray[np.float64]:
     """(9, 2) px over a part (row, column, height, width) with its corners."""
     row, column, height, width = part
     x, y = np.meshgrid([0, width / 2, width], [0, height / 2, height])
-    return np.c_[x.ravel() + column, y.ravel() + row] - 0.5
+    return np.asarray(np.c_[x.ravel() + column, y.ravel() + row] - 0.5, np.float64)
 
 
 def _led(source: MapFile, target: MapFile, px: NDArray[Any]) -> NDArray[np.float64] | None:

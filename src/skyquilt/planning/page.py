@@ -10,7 +10,8 @@ from shapely.geometry.base import BaseGeometry
 from skyquilt.planning.coverage import Cells
 from skyquilt.planning.lattice import to_uv
 from skyquilt.planning.records import Array, Plan
-from skyquilt.raster.map_source import FileSource, picture
+from skyquilt.raster.map_source import picture
+from skyquilt.raster.older_map import older_map
 from skyquilt.report import images
 from skyquilt.report.layers import MOST_VIEWS, view_colours
 from skyquilt.report.numbers import fixed, seconds
@@ -168,7 +169,7 @@ def colour(drone: int) -> str:
 def _base(plan: Plan, frame: Frame, base: Path | None) -> list[Markup]:
     if base is None:
         return []
-    rgba = picture(FileSource(path=base), plan.site.crs, frame.bounds,
+    rgba = picture(older_map(base), plan.site.crs, frame.bounds,
                    int(frame.width), int(frame.height))  # fmt: skip
     if rgba is None:
         return []

@@ -27,6 +27,7 @@ from skyquilt.planning.site import read_site
 from skyquilt.planning.stops import flights_of
 from skyquilt.planning.terrain import FLAT, Terrain, read_terrain
 from skyquilt.planning.view import find_view, narrowest
+from skyquilt.raster.older_map import older_map
 from skyquilt.raster.vector import lines, points
 from skyquilt.typed import typed
 
@@ -70,6 +71,8 @@ def iter_plan(order: Order, output: Path, *, overwrite: bool = False) -> Iterato
         UsageError, SideFileError, RefusedError, OutputError: one sentence each.
     """
     output = Path(output)
+    if order.base is not None:
+        older_map(order.base)  # refused before the routes are planned
     if is_mission(order.area):
         yield from refilled(order, output, overwrite=overwrite)
         return

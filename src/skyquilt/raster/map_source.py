@@ -199,7 +199,7 @@ class FileSource:
                 system = raster.crs
                 units = tuple(u or "" for u in raster.units[:bands])
                 self._known["about"] = About(
-                    crs=_plane(system.to_string()) if system else "",
+                    crs=plane(system.to_string()) if system else "",
                     bounds=tuple(raster.bounds),
                     bands=bands,
                     dtype=raster.dtypes[0],
@@ -240,9 +240,7 @@ class FileSource:
             )
             if west >= east or south >= north:
                 return None
-            step = max(gsd, raster.res[0], max(east - west, north - south) / 4096)
-            if step < 1.001 * raster.res[0]:
-                step = raster.res[0]
+            step = step_of(gsd, raster.res[0], max(east - west, north - south))
             # whole steps from the corner, or neighbouring parts would show shifted pixels
             west = left + math.floor((west - left) / step + 1e-6) * step
             north = top - math.floor((top - north) / step + 1e-6) * step
@@ -261,7 +259,13 @@ class FileSource:
         return Part(pixels=moved, shown=mask, west=west, north=north, gsd=step)
 
 
-def _plane(crs: str) -> str:
+def step_of(gsd: float, own: float, longest: float) -> float:
+    """Size of a part's pixels: as wanted, none finer than the map's own, at most 4096 of them."""
+    step = max(gsd, own, longest / 4096)
+    return own if step < 1.001 * own else step
+
+
+def plane(crs: str) -> str:
     """The horizontal part of a projection: a map is a plane, whatever its heights refer to."""
     from pyproj import CRS
 
@@ -297,6 +301,8 @@ def picture(
     if found is None:
         return None
     part, u, v = found
+    if scale is None and part.pixels.dtype != np.uint8 and palette != "numbers":
+        scale = _scale_of(part)
     colour, shown = coloured(part.pixels, scale, palette), part.shown.astype(np.uint8) * 255
     out = np.empty((height, width, 4), np.uint8)
     for r0 in range(0, height, ROWS):  # the coordinates of all pixels would need most memory
@@ -308,6 +314,12 @@ def picture(
             shown, ui, vi, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT
         )
     return out if out[..., 3].any() else None
+
+
+def _scale_of(part: Part) -> tuple[float, float]:
+    """The range of what is shown; what stands where nothing is may be anything."""
+    shown = part.pixels[part.shown]
+    return (float(shown.min()), float(shown.max())) if len(shown) else (0.0, 1.0)
 
 
 def values(

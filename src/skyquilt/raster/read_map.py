@@ -55,6 +55,8 @@ class MapFile:
     """Stored value of pixels without data; found in the pixels where the file states none."""
     masked: bool = False
     """Whether the file itself says which pixels have data."""
+    beside: bool = False
+    """Whether control points, or a file beside it, place it."""
 
     @property
     def mirrored(self) -> bool:
@@ -115,6 +117,7 @@ def open_map(path: Path) -> MapFile | None:
                 palette=palette,
                 nodata=_nodata(raster),
                 masked=_masked(raster),
+                beside=raster.crs is None or raster.transform.is_identity,
             )
     except (rasterio.errors.RasterioError, UnicodeDecodeError):
         return None
@@ -178,14 +181,12 @@ def read_part(
     source: MapFile, part: tuple[int, int, int, int], longest: int
 ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
     """The same of a part (row, column, height, width) that lies inside the raster."""
-    from rasterio.windows import Window
-
-    row, column, height, width = part
+    _, _, height, width = part
     aspect = source.aspect if abs(np.log(source.aspect)) > 0.01 else 1.0
     rows, columns = height * min(1.0, 1 / aspect), width * min(1.0, aspect)
     scale = max(1.0, max(rows, columns) / longest)
     shape = (max(1, round(rows / scale)), max(1, round(columns / scale)))
-    return _read(source, Window(column, row, width, height), shape)
+    return read_as(source, part, shape)
 
 
 def read_window(
@@ -196,9 +197,21 @@ def read_window(
     Raises:
         OSError: the file's data are damaged, or are no measurements.
     """
+    return read_as(source, (row, column, height, width), (height, width))
+
+
+def read_as(
+    source: MapFile, part: tuple[int, int, int, int], shape: tuple[int, int]
+) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """A part (row, column, height, width) averaged to another shape (height, width).
+
+    Raises:
+        OSError: the file's data are damaged, or are no measurements.
+    """
     from rasterio.windows import Window
 
-    return _read(source, Window(column, row, width, height), (height, width))
+    row, column, height, width = part
+    return _read(source, Window(column, row, width, height), shape)
 
 
 def _read(

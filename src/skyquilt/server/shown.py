@@ -7,9 +7,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from skyquilt.errors import UsageError
-from skyquilt.raster.map_source import FileSource, MapSource
-from skyquilt.raster.read_map import open_map
+from skyquilt.raster.map_source import MapSource
+from skyquilt.raster.older_map import older_map
 from skyquilt.runs.layers import RunLayer
 
 
@@ -70,13 +69,11 @@ def base_map(paths: Path | Sequence[Path] | None) -> dict[str, MapSource]:
     """Older maps (GeoTIFF, COG, MBTiles) as layers `base`, `base-2` ...; empty if none is given.
 
     Raises:
-        UsageError: one is not a georeferenced raster.
+        UsageError: one is not a georeferenced raster, or lies in a local system.
     """
     found: dict[str, MapSource] = {}
     for number, path in enumerate([paths] if isinstance(paths, Path) else paths or (), 1):
-        if open_map(path) is None or not FileSource(path=path).crs:
-            raise UsageError(f"--base {path} is not a georeferenced map that GDAL can read")
-        found["base" if number == 1 else f"base-{number}"] = FileSource(path=path)
+        found["base" if number == 1 else f"base-{number}"] = older_map(path)
     return found
 
 
