@@ -3,7 +3,6 @@
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,14 +10,31 @@ from shapely import contains_xy
 from shapely.geometry.base import BaseGeometry
 
 from skyquilt.errors import SideFileError
-from skyquilt.outside import plain
 from skyquilt.planning.records import Array
-from skyquilt.raster.drivers import GEOTIFF, why_unreadable
+from skyquilt.raster.drivers import open_raster, why_unreadable
+from skyquilt.raster.map_source import between, plane
+from skyquilt.raster.read_map import MapFile, open_map, read_as
 
 MOST_SIDE = 3000
 """Largest number of heights along one side."""
 HEIGHTS = (-500.0, 9000.0)
 """Heights in m that are taken for ground."""
+_AROUND = 4
+"""Pixels of the file around what is needed."""
+_FEET = (
+    "ft",
+    "foot",
+    "feet",
+    "footinternational",
+    "internationalfoot",
+    "ftus",
+    "usft",
+    "ussurveyfoot",
+    "ussurveyfeet",
+    "footus",
+    "footussurvey",
+)
+"""Words for feet as units of bands."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -90,43 +106,21 @@ def read_terrain(path: Path, crs: str, area: BaseGeometry, margin: float) -> Ter
     Beyond the area, holes are closed with the nearest height.
 
     Raises:
-        SideFileError: the file is no georeferenced raster, lies elsewhere, or has holes in the
-            area.
+        SideFileError: the file is no georeferenced raster of heights, lies elsewhere, or has holes
+            in the area.
     """
-    import rasterio
-    from rasterio.errors import NotGeoreferencedWarning
-    from rasterio.warp import Resampling, reproject, transform_bounds
-
     path = Path(path)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            source = rasterio.open(path, driver=GEOTIFF)
-        with source:
-            if source.crs is None:
-                raise SideFileError(
-                    f"{path.name} does not say its coordinate system; write it into the file (for"
-                    " instance with gdal_edit -a_srs)"
-                )
-            _check_place(path, transform_bounds(source.crs, crs, *source.bounds), area)
-            empty, west, north, cell = _grid(source, crs, area, margin)
-            reproject(
-                rasterio.band(source, 1),
-                empty,
-                src_nodata=source.nodata,
-                dst_transform=rasterio.transform.from_origin(west, north, cell, cell),
-                dst_crs=crs,
-                dst_nodata=np.nan,
-                resampling=Resampling.bilinear,
-            )
-    except rasterio.errors.RasterioError as error:
+    file = _opened(path)
+    around = area.buffer(margin).bounds
+    part = _part(file, crs, around)
+    if part is None:
         raise SideFileError(
-            f"{path.name} cannot be read as a raster of heights: {why_unreadable(error)}"
-        ) from error
-    except (rasterio.errors.CRSError, ValueError) as error:
-        raise SideFileError(
-            f"{path.name} cannot be read as a raster of heights: {plain(str(error), 200)}"
-        ) from error
+            f"{path.name} has no height in the area: it lies elsewhere on Earth; give the terrain"
+            " of the area"
+        )
+    heights, placed = _read(file, part)
+    empty, west, north, cell = _grid(file, crs, around)
+    _project(heights, placed, str(file.crs), empty, (west, north, cell), crs)
     return Terrain(
         heights=_closed(path, empty, west, north, cell, area),
         west=west,
@@ -136,27 +130,143 @@ def read_terrain(path: Path, crs: str, area: BaseGeometry, margin: float) -> Ter
     )
 
 
-def _check_place(path: Path, there: tuple[float, float, float, float], area: BaseGeometry) -> None:
-    west, south, east, north = area.bounds
-    if not np.isfinite(there).all() or (
-        there[0] > east or there[2] < west or there[1] > north or there[3] < south
-    ):
+def _opened(path: Path) -> MapFile:
+    """The raster, if it is one of heights whose place on Earth is known."""
+    import rasterio
+    from pyproj import CRS
+    from rasterio.errors import NotGeoreferencedWarning
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            with open_raster(path):
+                pass
+    except (rasterio.errors.RasterioError, UnicodeDecodeError) as error:
         raise SideFileError(
-            f"{path.name} has no height in the area: it lies elsewhere on Earth; give the terrain"
-            " of the area"
+            f"{path.name} cannot be read as a raster of heights: {why_unreadable(error)}"
+        ) from error
+    file = open_map(path)
+    if file is None or file.crs is None:
+        raise SideFileError(
+            f"{path.name} does not say its coordinate system; write it into the file (for"
+            " instance with gdal_edit -a_srs)"
         )
+    system = CRS.from_wkt(file.crs)
+    if not (system.is_geographic or system.is_projected):
+        raise SideFileError(
+            f"{path.name} lies in a local coordinate system, which tells no place on Earth; give"
+            " heights in one such as EPSG:32633"
+        )
+    if file.bands == 3:
+        raise SideFileError(f"{path.name} is a picture with colours, not a raster of heights")
+    if file.stored == "uint8" and file.scale == (1.0, 0.0) and not file.unit:
+        raise SideFileError(
+            f"{path.name} holds grey levels of 0 to 255, as a picture or a hillshade, not heights"
+            " in m"
+        )
+    return file
+
+
+def _part(
+    file: MapFile, crs: str, around: tuple[float, float, float, float]
+) -> tuple[int, int, int, int] | None:
+    """Row, column, height and width of the part of the file that shows a rectangle (west, south,
+    east, north) of another CRS; None if there is none.
+    """
+    west, south, east, north = around
+    x, y = np.meshgrid(np.linspace(west, east, 5), np.linspace(south, north, 5))
+    x, y = between(crs, str(file.crs)).transform(x.ravel(), y.ravel())
+    a, b, c, d, e, f = file.affine
+    px = np.linalg.solve(
+        np.array([[a, b], [d, e]]), np.array([np.subtract(x, c), np.subtract(y, f)])
+    )
+    if not np.isfinite(px).all():
+        return None
+    size = np.array([file.width, file.height])
+    inside = np.clip([px.min(1), px.max(1)], 0, size)
+    if (inside[1] - inside[0] <= 0).any():
+        return None
+    low = np.clip(np.floor(px.min(1)) - _AROUND, 0, size).astype(int)
+    high = np.clip(np.ceil(px.max(1)) + _AROUND, 0, size).astype(int)
+    return int(low[1]), int(low[0]), int(high[1] - low[1]), int(high[0] - low[0])
+
+
+def _read(
+    file: MapFile, part: tuple[int, int, int, int]
+) -> tuple[NDArray[np.float32], tuple[float, ...]]:
+    """Heights in m of a part (NaN where there are none), at most twice as many along a side as a
+    terrain has, and the affine that places them.
+    """
+    row, column, height, width = part
+    shape = min(height, 2 * MOST_SIDE), min(width, 2 * MOST_SIDE)
+    try:
+        values, valid = read_as(file, part, shape)
+    except OSError as error:
+        raise SideFileError(f"{file.path.name} cannot be read: {error}") from error
+    heights = values.astype(np.float32) * np.float32(_metres(file))
+    # before anything is interpolated, or what is no height would be mixed with what is
+    good = valid & (heights >= HEIGHTS[0]) & (heights <= HEIGHTS[1])
+    a, b, c, d, e, f = file.affine
+    x, y = width / shape[1], height / shape[0]
+    moved = a * column + b * row + c, d * column + e * row + f
+    placed = a * x, b * y, moved[0], d * x, e * y, moved[1]
+    return np.where(good, heights, np.float32("nan")), placed
+
+
+def _metres(file: MapFile) -> float:
+    """Metres per unit of the heights: as the band says, else the vertical part of the CRS."""
+    from pyproj import CRS
+
+    word = "".join(c for c in file.unit.lower() if c.isalpha())
+    if word:
+        if word in _FEET:
+            return 1200 / 3937 if "us" in word else 0.3048
+        return {"cm": 0.01, "centimetre": 0.01, "centimeter": 0.01, "dm": 0.1}.get(word, 1.0)
+    parts = CRS.from_wkt(str(file.crs)).sub_crs_list
+    heights = [axis for part in parts if part.is_vertical for axis in part.axis_info]
+    return float(heights[0].unit_conversion_factor) if heights else 1.0
+
+
+def _project(
+    heights: NDArray[np.float32],
+    placed: tuple[float, ...],
+    source: str,
+    out: NDArray[np.float32],
+    to: tuple[float, float, float],
+    crs: str,
+) -> None:
+    """Interpolates heights onto the grid of `out` (west, north, cell)."""
+    from rasterio.transform import Affine, from_origin
+    from rasterio.warp import Resampling, reproject
+
+    west, north, cell = to
+    reproject(
+        heights,
+        out,
+        src_transform=Affine(*placed),
+        src_crs=plane(source),
+        src_nodata=np.nan,
+        dst_transform=from_origin(west, north, cell, cell),
+        dst_crs=crs,
+        dst_nodata=np.nan,
+        resampling=Resampling.bilinear,
+    )
 
 
 def _grid(
-    source: Any, crs: str, area: BaseGeometry, margin: float
+    file: MapFile, crs: str, around: tuple[float, float, float, float]
 ) -> tuple[NDArray[np.float32], float, float, float]:
-    """An empty raster over the area grown by the margin, about as fine as the file."""
+    """An empty raster over a rectangle, about as fine as the file."""
     from rasterio.warp import calculate_default_transform
 
-    west, south, east, north = area.buffer(margin).bounds
+    west, south, east, north = around
+    a, b, c, d, e, f = file.affine
+    column, row = np.array([0, 1, 0, 1]) * file.width, np.array([0, 0, 1, 1]) * file.height
+    x, y = a * column + b * row + c, d * column + e * row + f
     affine, _, _ = calculate_default_transform(
-        source.crs, crs, source.width, source.height, *source.bounds
-    )
+        plane(str(file.crs)), crs, file.width, file.height,
+        float(x.min()), float(y.min()), float(x.max()), float(y.max()),
+    )  # fmt: skip
     cell = max(abs(affine.a), (east - west) / MOST_SIDE, (north - south) / MOST_SIDE)
     shape = int((north - south) / cell) + 2, int((east - west) / cell) + 2
     return np.full(shape, np.nan, np.float32), west, north, float(cell)
