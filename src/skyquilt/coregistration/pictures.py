@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.coregistration.candidates import middle, similarity
+from skyquilt.coregistration.places import Lies, map_in_map, photo_in_map, shared_boxes
 from skyquilt.errors import UnreadablePhotoError, UsageError
-from skyquilt.geometry.transforms import transfer
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.registration import Guess, Matrix, Picture
 from skyquilt.photos.pixels import read_color
@@ -90,10 +90,6 @@ LONGEST = 2048
 """Largest size in px of the longer side at which a photo or map is registered; the output is
 resampled at full size.
 """
-_SHARE = 0.1
-"""Largest error of the places of two maps, as a share of the smaller one's longer side, ..."""
-_POSITIONS_M = 6.0
-"""... or in m, whichever is more: of drones' own positions, without control points."""
 _MOST_REACH = 0.5
 """Largest share of b's longer side that is searched around a guess."""
 _WHOLE = 0.7
@@ -216,137 +212,78 @@ def _enlarging(x: float, y: float) -> Matrix:
 
 
 def common_parts(a: Source, b: Source) -> tuple[Source, Source] | None:
-    """The parts of two maps that show the same ground by what their files say, at a resolution of
-    their own; None if that is nothing, or most of what can be seen in the whole maps.
+    """The parts of two files that show the same ground by what they say, maps at a resolution of
+    their own; None if that is nothing, or most of what can be seen in the whole files.
     """
-    if a.place is None or b.place is None:
+    lies = _lies(a, b)
+    if lies is None:
         return None
-    b_H_a = _between(a.place, b.place)
-    if b_H_a is None:
-        return None
-    margin = _reach_px(a.place, b.place, b_H_a)
-    back = np.asarray(np.linalg.inv(b_H_a), np.float64)
-    smaller = float(np.sqrt(abs(np.linalg.det(back[:2, :2]))))
-    px_a, px_b = (_grid((0, 0, s.height, s.width)) for s in (a, b))
-    in_b = _box(transfer(b_H_a, px_a), margin, (b.width, b.height))
-    in_a = _box(transfer(back, px_b), margin * smaller, (a.width, a.height))
+    frames = ((s.width, s.height) for s in (a, b))
+    in_a, in_b = shared_boxes(lies, *frames)
     if in_a is None or in_b is None:
         return None
     finer = [
-        max(s.height, s.width) > LONGEST and part[2] * part[3] < _WHOLE * s.height * s.width
+        s.place is not None
+        and max(s.height, s.width) > LONGEST
+        and part[2] * part[3] < _WHOLE * s.height * s.width
         for s, part in ((a, in_a), (b, in_b))
     ]
     if not any(finer):
         return None
     try:
-        parts = [_part(s.place, p) for s, p in ((a, in_a), (b, in_b)) if s.place]
+        return _of_part(a, in_a), _of_part(b, in_b)
     except OSError:
         return None
-    (one, full_a), (other, full_b) = parts
-    return (
-        replace(a, picture=one, full_S_picture=full_a),
-        replace(b, picture=other, full_S_picture=full_b),
-    )
 
 
-def _box(
-    px: NDArray[np.float64], margin: float, size: tuple[int, int]
-) -> tuple[int, int, int, int] | None:
-    """Row, column, height and width of the part of a file of `size` (width, height) on which px
-    (n, 2) lie, widened by a margin; None if there is none.
-    """
-    low = np.clip(np.floor(px.min(0) - margin), 0, size).astype(int)
-    high = np.clip(np.ceil(px.max(0) + margin) + 1, 0, size).astype(int)
-    if (high - low < 1).any():
-        return None
-    return int(low[1]), int(low[0]), int(high[1] - low[1]), int(high[0] - low[0])
+def _of_part(source: Source, part: tuple[int, int, int, int]) -> Source:
+    """The same file, a map by a part of it only."""
+    if source.place is None:
+        return source
+    picture, full = _part(source.place, part)
+    return replace(source, picture=picture, full_S_picture=full)
 
 
 def guess_of(a: Source, b: Source) -> Guess | None:
     """The guess from metadata or georeferences, in px of the images; None if they give none."""
-    if a.place and b.place:
-        guess = _from_places(a, b)
-    elif a.photo and b.photo:
-        guess = from_metadata(a.photo, b.photo)
-    else:
-        return None
+    guess = from_metadata(a.photo, b.photo) if a.photo and b.photo else _by_places(a, b)
     if guess is None:
         return None
     small = np.linalg.inv(b.full_S_picture) @ guess.b_H_a @ a.full_S_picture
     return replace(guess, b_H_a=small / small[2, 2])
 
 
-def _from_places(a: Source, b: Source) -> Guess | None:
-    """The transform between two georeferences: an affine one through the overlap's corners."""
-    assert a.place is not None and b.place is not None
-    b_H_a = _between(a.place, b.place)
-    if b_H_a is None:
+def _by_places(a: Source, b: Source) -> Guess | None:
+    """The guess where one or both are maps; in px of the files, its reach for b's picture."""
+    lies = _lies(a, b)
+    if lies is None:
         return None
     scale = float(np.sqrt(abs(np.linalg.det(b.full_S_picture[:2, :2]))))
-    longest = scale * max(b.picture.shape)
+    reach = min(lies.off_px / (scale * max(b.picture.shape)), _MOST_REACH)
+    if a.place and b.place:
+        return Guess(
+            b_H_a=lies.b_H_a,
+            reach=reach,
+            rotation_deg=4.0,
+            scale=1.08,
+            source="the places of both maps",
+        )
     return Guess(
-        b_H_a=b_H_a,
-        reach=min(_reach_px(a.place, b.place, b_H_a) / longest, _MOST_REACH),
-        rotation_deg=4.0,
-        scale=1.08,
-        source="the places of both maps",
+        b_H_a=lies.b_H_a,
+        reach=reach,
+        rotation_deg=_TURN_DEG,
+        scale=_SCALE,
+        source="the photo's metadata and the map's place",
     )
 
 
-def _between(a: MapFile, b: MapFile) -> Matrix | None:
-    """The affine transform from a's pixels to b's that their georeferences tell, the best one where
-    both have content; None if they tell none, or the maps have nothing in common.
-    """
-    frame_a, frame_b = ((p.width, p.height) for p in (a, b))
-    whole = (0, 0, a.height, a.width)
-    back = _led(b, a, _grid((0, 0, b.height, b.width)))
-    part = whole if back is None else _box(back, 0.0, frame_a)
-    if part is None:
-        return None
-    px = _grid(part)
-    there = _led(a, b, px)
-    if there is None or _box(there, 0.0, frame_b) is None:
-        return None
-    linear, *_ = np.linalg.lstsq(np.c_[px, np.ones(len(px))], there, rcond=None)
-    return np.vstack([linear.T, [0, 0, 1.0]])
-
-
-def _grid(part: tuple[int, int, int, int]) -> NDArray[np.float64]:
-    """(9, 2) px over a part (row, column, height, width) with its corners."""
-    row, column, height, width = part
-    x, y = np.meshgrid([0, width / 2, width], [0, height / 2, height])
-    return np.asarray(np.c_[x.ravel() + column, y.ravel() + row] - 0.5, np.float64)
-
-
-def _led(source: MapFile, target: MapFile, px: NDArray[Any]) -> NDArray[np.float64] | None:
-    """Where px (n, 2) of one map lie in another, by their georeferences; None if that cannot be
-    told. A map that states no CRS has that of the other.
-    """
-    x, y = _on_ground(source, px)
-    one, other = source.crs or target.crs, target.crs or source.crs
-    if one and other and one != other:
-        from pyproj import Transformer
-        from pyproj.exceptions import CRSError, ProjError
-
-        try:
-            x, y = Transformer.from_crs(one, other, always_xy=True).transform(x, y)
-        except (CRSError, ProjError):  # one is local, and nothing leads from it to the other
-            return None
-    p, q, c, r, s, f = target.affine
-    there = np.linalg.solve(np.array([[p, q], [r, s]]), np.array([x - c, y - f])).T - 0.5
-    return np.asarray(there, np.float64) if np.isfinite(there).all() else None
-
-
-def _reach_px(a: MapFile, b: MapFile, b_H_a: Matrix) -> float:
-    """How far in px of b the places of both maps may be off: a share of the smaller one, or what
-    positions of drones are off.
-    """
-    scale = float(np.sqrt(abs(np.linalg.det(b_H_a[:2, :2]))))
-    reach = _SHARE * min(max(b.width, b.height), scale * max(a.width, a.height))
-    return reach if b.metres is None else max(reach, _POSITIONS_M / min(b.metres))
-
-
-def _on_ground(place: MapFile, px: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    a, b, c, d, e, f = place.affine
-    column, row = px[:, 0] + 0.5, px[:, 1] + 0.5
-    return a * column + b * row + c, d * column + e * row + f
+def _lies(a: Source, b: Source) -> Lies | None:
+    """Where a lies in b by what the files say, in px of the files, if one or both are maps."""
+    if a.place and b.place:
+        return map_in_map(a.place, b.place)
+    if a.photo and b.place:
+        return photo_in_map(a.photo, b.place, _REACH)
+    if a.place and b.photo:
+        found = photo_in_map(b.photo, a.place, _REACH)
+        return found and found.inverse()
+    return None

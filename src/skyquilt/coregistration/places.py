@@ -1,0 +1,171 @@
+"""Where one file lies in another by what both say of their places on the ground."""
+
+from dataclasses import dataclass
+from math import cos, radians
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.geometry.frames import ned_from_body
+from skyquilt.geometry.transforms import fit, transfer
+from skyquilt.model.photo import Photo
+from skyquilt.model.registration import Matrix
+from skyquilt.raster.read_map import MapFile
+
+Box = tuple[int, int, int, int]
+"""Row, column, height and width of a part of a file in px."""
+_EARTH_M = 6378137.0
+_SHARE = 0.1
+"""Largest error of the places of two maps, as a share of the smaller one's longer side, ..."""
+_POSITIONS_M = 6.0
+"""... or in m, whichever is more: of drones' own positions, without control points."""
+_LEAST_M = 5.0
+"""Least height above take-off in m of a photo taken in flight."""
+_MOST_TILT_DEG = 30.0
+"""Largest tilt of a photo whose ground is taken for a part of a map."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Lies:
+    """Where a lies in b."""
+
+    b_H_a: Matrix
+    """(3, 3) px of the files."""
+    off_px: float
+    """How far it may be off, px of b."""
+
+    def inverse(self) -> "Lies":
+        """Where b lies in a."""
+        back = np.asarray(np.linalg.inv(self.b_H_a), np.float64)
+        back = back / back[2, 2]
+        return Lies(b_H_a=back, off_px=self.off_px * _size(back))
+
+
+def _size(matrix: Matrix) -> float:
+    """Px of the target per px of the source, about."""
+    return float(np.sqrt(abs(np.linalg.det(matrix[:2, :2]))))
+
+
+def map_in_map(a: MapFile, b: MapFile) -> Lies | None:
+    """By the georeferences of both; None if they tell nothing, or the maps have nothing in common.
+    They may be off by a share of the smaller one, or by what positions of drones are off.
+    """
+    b_H_a = _between(a, b)
+    if b_H_a is None:
+        return None
+    off = _SHARE * min(max(b.width, b.height), _size(b_H_a) * max(a.width, a.height))
+    if b.metres is not None:
+        off = max(off, _POSITIONS_M / min(b.metres))
+    return Lies(b_H_a=b_H_a, off_px=off)
+
+
+def photo_in_map(photo: Photo, target: MapFile, off: float) -> Lies | None:
+    """By the photo's position, height above take-off, angles and focal length, over flat ground;
+    `off`: how far it may be off, as a share of its longer side. None if one of these is missing.
+    """
+    position, angles = photo.position, photo.attitude
+    if position is None or angles is None or target.crs is None or photo.focal.source == "guess":
+        return None
+    height = position.takeoff_m
+    if height is None or height < _LEAST_M:
+        return None
+    if np.hypot(angles.pitch_deg, angles.roll_deg) > _MOST_TILT_DEG:
+        return None
+    px = _grid((0, 0, photo.height, photo.width))
+    middle = np.array([(photo.width - 1) / 2, (photo.height - 1) / 2])
+    right, back = ((px - middle) / photo.focal.px).T
+    rays = np.stack([-back, right, np.ones(len(px))])  # nose, right, belly
+    north, east, down = ned_from_body(angles.yaw_deg, angles.pitch_deg, angles.roll_deg) @ rays
+    if (down < 0.1).any():
+        return None
+    latitude = position.latitude_deg + np.degrees(height * north / down / _EARTH_M)
+    per = _EARTH_M * cos(radians(position.latitude_deg))
+    longitude = position.longitude_deg + np.degrees(height * east / down / per)
+    there = _places(target, np.asarray(longitude), np.asarray(latitude), "EPSG:4326")
+    if there is None or box(there, 0.0, (target.width, target.height)) is None:
+        return None
+    found = fit("homography", px, there)
+    if found is None:
+        return None
+    return Lies(b_H_a=found, off_px=off * max(photo.width, photo.height) * _size(found))
+
+
+def shared_boxes(
+    lies: Lies, frame_a: tuple[int, int], frame_b: tuple[int, int]
+) -> tuple[Box | None, Box | None]:
+    """The parts of a and of b (width, height) that may show the same ground."""
+    back = lies.inverse()
+    px_a, px_b = (_grid((0, 0, height, width)) for width, height in (frame_a, frame_b))
+    return (
+        box(transfer(back.b_H_a, px_b), back.off_px, frame_a),
+        box(transfer(lies.b_H_a, px_a), lies.off_px, frame_b),
+    )
+
+
+def box(px: NDArray[np.float64], margin: float, size: tuple[int, int]) -> Box | None:
+    """Row, column, height and width of the part of a file of `size` (width, height) on which px
+    (n, 2) lie, widened by a margin; None if there is none.
+    """
+    low = np.clip(np.floor(px.min(0) - margin), 0, size).astype(int)
+    high = np.clip(np.ceil(px.max(0) + margin) + 1, 0, size).astype(int)
+    if (high - low < 1).any():
+        return None
+    return int(low[1]), int(low[0]), int(high[1] - low[1]), int(high[0] - low[0])
+
+
+def _between(a: MapFile, b: MapFile) -> Matrix | None:
+    """The affine transform from a's pixels to b's that their georeferences tell, the best one where
+    both have content; None if they tell none, or the maps have nothing in common.
+    """
+    frame_a, frame_b = ((p.width, p.height) for p in (a, b))
+    whole = (0, 0, a.height, a.width)
+    back = _led(b, a, _grid((0, 0, b.height, b.width)))
+    part = whole if back is None else box(back, 0.0, frame_a)
+    if part is None:
+        return None
+    px = _grid(part)
+    there = _led(a, b, px)
+    if there is None or box(there, 0.0, frame_b) is None:
+        return None
+    linear, *_ = np.linalg.lstsq(np.c_[px, np.ones(len(px))], there, rcond=None)
+    return np.vstack([linear.T, [0, 0, 1.0]])
+
+
+def _grid(part: tuple[int, int, int, int]) -> NDArray[np.float64]:
+    """(9, 2) px over a part (row, column, height, width) with its corners."""
+    row, column, height, width = part
+    x, y = np.meshgrid([0, width / 2, width], [0, height / 2, height])
+    return np.asarray(np.c_[x.ravel() + column, y.ravel() + row] - 0.5, np.float64)
+
+
+def _led(source: MapFile, target: MapFile, px: NDArray[Any]) -> NDArray[np.float64] | None:
+    """Where px (n, 2) of one map lie in another, by their georeferences; None if that cannot be
+    told. A map that states no CRS has that of the other.
+    """
+    x, y = _on_ground(source, px)
+    return _places(target, x, y, source.crs or target.crs)
+
+
+def _places(
+    target: MapFile, x: NDArray[Any], y: NDArray[Any], one: str | None
+) -> NDArray[np.float64] | None:
+    """Where x and y of a CRS lie in a map, (n, 2) px; None if that cannot be told."""
+    other = target.crs or one
+    if one and other and one != other:
+        from pyproj import Transformer
+        from pyproj.exceptions import CRSError, ProjError
+
+        try:
+            x, y = Transformer.from_crs(one, other, always_xy=True).transform(x, y)
+        except (CRSError, ProjError):  # one is local, and nothing leads from it to the other
+            return None
+    p, q, c, r, s, f = target.affine
+    there = np.linalg.solve(np.array([[p, q], [r, s]]), np.array([x - c, y - f])).T - 0.5
+    return np.asarray(there, np.float64) if np.isfinite(there).all() else None
+
+
+def _on_ground(place: MapFile, px: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    a, b, c, d, e, f = place.affine
+    column, row = px[:, 0] + 0.5, px[:, 1] + 0.5
+    return a * column + b * row + c, d * column + e * row + f
