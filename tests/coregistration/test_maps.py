@@ -1,5 +1,8 @@
 """Maps as other programs write them: types, missing data, places; against distortions made here."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -9,10 +12,16 @@ from rasterio.control import GroundControlPoint
 from rasterio.transform import Affine
 
 from skyquilt.coregistration.pictures import common_parts, guess_of, open_picture
+from skyquilt.coregistration.places import photo_in_map
 from skyquilt.coregistration.usable import filled, usable
-from skyquilt.coregistration.workflow import register
-from skyquilt.model.registration import ErrorField, Picture
+from skyquilt.coregistration.workflow import outcome_of, register
+from skyquilt.geometry.frames import cam_R_map_from_angles
+from skyquilt.geometry.transforms import transfer
+from skyquilt.model.photo import Attitude, Photo
+from skyquilt.model.registration import ErrorField, Picture, Registration
+from skyquilt.raster.read_map import MapFile
 from tests.coregistration.scenes import error, layout, pair, spectrum, turned
+from tests.coregistration.test_metadata import photo
 
 SHAPE = (400, 480)
 TRUTH = turned(0.95, 21.0, SHAPE, SHAPE, (6.0, -9.0))
@@ -348,3 +357,88 @@ def test_an_error_is_the_same_in_other_pixels():
     wide = field.seen_in(np.diag([2.0, 1, 1])).bound_px(px * [2, 1])
     assert (wide >= field.bound_px(px) - 1e-9).all()
     assert (wide <= 2 * field.bound_px(px) + 1e-9).all()
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32633", "EPSG:4326", "EPSG:32634"])
+@pytest.mark.parametrize("angles", [(0.0, 0.0, 0.0), (75.0, 12.0, -8.0), (-130.0, -4.0, 15.0)])
+def test_what_a_photo_shows_of_a_map(crs, angles):
+    """Against rays from its camera to places of the map, by PROJ's topocentric frame."""
+    lon, lat, height, focal = 14.3, 46.6, 80.0, 700.0
+    yaw, pitch, roll = angles
+    of = photo(0, 0, height, yaw, focal, 640, 512)
+    of = replace(
+        of,
+        position=replace(of.position, latitude_deg=lat, longitude_deg=lon),
+        attitude=Attitude(yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll),
+    )
+    change = Transformer.from_crs(4326, crs, always_xy=True)
+    x, y = change.transform(lon, lat)
+    step = 0.2 / 111_195 if crs == "EPSG:4326" else 0.2
+    place = Affine(step, 0, x - 900 * step, 0, -step, y + 800 * step)
+    target = MapFile(
+        path=Path("m.tif"), width=1800, height=1600, bands=3, affine=tuple(place)[:6], crs=crs
+    )
+    lies = photo_in_map(of, target, 0.3)
+    px = np.array([[100.0, 60], [600, 100], [320, 250], [50, 480], [610, 500]])
+    there = transfer(lies.b_H_a, px) + 0.5
+    mx, my = place @ (there[:, 0], there[:, 1])
+    glon, glat = Transformer.from_crs(crs, 4326, always_xy=True).transform(mx, my)
+    pipeline = (
+        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart"
+        " +ellps=WGS84 +step +proj=topocentric +ellps=WGS84"
+        f" +lon_0={lon} +lat_0={lat} +h_0={height}"
+    )
+    east, north, up = Transformer.from_pipeline(pipeline).transform(glon, glat, np.zeros(5))
+    rays = cam_R_map_from_angles(yaw, pitch, roll) @ np.stack([east, north, up])
+    seen = np.stack([focal * rays[0] / rays[2] + 319.5, focal * rays[1] / rays[2] + 255.5], 1)
+    # a sphere's radius for an ellipsoid's: 0.3 % of the way from the middle
+    assert np.abs(seen - px).max() < 0.004 * 400 + 0.2
+    back = lies.inverse()
+    assert back.off_px == 0.3 * 640
+    # pixels of the ground: 80 m / 700 px, longer where it is seen aslant, and degrees are no m
+    assert back.off_a_px * 0.2 == pytest.approx(0.3 * 640 * 80 / 700, rel=0.3)
+
+
+def test_a_photo_without_height_or_angles_lies_nowhere(scene):
+    path, _ = scene
+    place = open_picture(path).place
+    lon, lat = Transformer.from_crs(32633, 4326, always_xy=True).transform(500_120, 4_999_900)
+    of = photo(0, 0, 80.0, 0.0, 700.0, 640, 512)
+    of = replace(of, position=replace(of.position, latitude_deg=lat, longitude_deg=lon))
+    assert photo_in_map(of, place, 0.3) is not None
+    for less in (
+        {"attitude": None},
+        {"position": None},
+        {"position": replace(of.position, takeoff_m=None)},
+        {"focal": replace(of.focal, source="guess")},
+        {"attitude": Attitude(yaw_deg=0, pitch_deg=50, roll_deg=0)},
+        {"position": replace(of.position, latitude_deg=lat + 1)},
+    ):
+        assert photo_in_map(replace(of, **less), place, 0.3) is None
+
+
+def test_a_photo_of_a_tenth_of_a_map_is_found(tmp_path):
+    """It was refused: a photo shows too small a part of a map to be found without its position."""
+    labels = layout(1000, 1100, seed=31)
+    a = np.clip(spectrum(labels, 1), 1, 255).astype(np.uint8)
+    write(tmp_path / "a.tif", a, PLACE_A)
+    yaw, height, focal, size = 200.0, 60.0, 300.0, (400, 320)
+    x, y = PLACE_A @ (420.0, 610.0)
+    lon, lat = Transformer.from_crs(32633, 4326, always_xy=True).transform(x, y)
+    scale = 0.5 * focal / height
+    # the photo's top looks along the yaw: a's pixels turn by its negative
+    truth = turned(scale, -yaw, (1, 1), (320, 400))
+    truth = truth @ np.array([[1, 0, -419.5], [0, 1, -609.5], [0, 0, 1.0]])
+    fine = cv2.GaussianBlur(spectrum(labels, 2), (0, 0), 0.5)
+    b = np.clip(cv2.warpPerspective(fine, truth, size), 0, 255).astype(np.uint8)
+    of = photo(0, 0, height, yaw, focal, *size)
+    wrong = replace(of.position, latitude_deg=lat + 3 / 111_000, longitude_deg=lon - 4 / 78_000)
+    one = open_picture(tmp_path / "a.tif")
+    place = write(tmp_path / "b.tif", b, None, crs=None)
+    other = replace(open_picture(place), photo=replace(of, position=wrong))
+    assert isinstance(other.photo, Photo) and other.place is None
+    found = outcome_of(one, other, "auto", guess_of(one, other))
+    assert isinstance(found, Registration)
+    px = np.array([[420, 610, 1], [460, 580, 1], [400, 650, 1.0]])
+    there, right = px @ found.b_H_a.T, px @ truth.T
+    assert np.abs(there[:, :2] / there[:, 2:] - right[:, :2]).max() < 0.8

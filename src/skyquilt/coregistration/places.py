@@ -33,18 +33,20 @@ class Lies:
     b_H_a: Matrix
     """(3, 3) px of the files."""
     off_px: float
-    """How far it may be off, px of b."""
+    """How far it may be off, px of b, ..."""
+    off_a_px: float
+    """... and px of a."""
 
     def inverse(self) -> "Lies":
         """Where b lies in a."""
         back = np.asarray(np.linalg.inv(self.b_H_a), np.float64)
-        back = back / back[2, 2]
-        return Lies(b_H_a=back, off_px=self.off_px * _size(back))
+        return Lies(b_H_a=back / back[2, 2], off_px=self.off_a_px, off_a_px=self.off_px)
 
 
-def _size(matrix: Matrix) -> float:
-    """Px of the target per px of the source, about."""
-    return float(np.sqrt(abs(np.linalg.det(matrix[:2, :2]))))
+def _size(matrix: Matrix, at: NDArray[np.float64]) -> float:
+    """Px of the target per px of the source at a place (2,) of it."""
+    ends = transfer(matrix, at + np.array([[0.0, 0], [1, 0], [0, 1]]))
+    return float(np.sqrt(abs(np.linalg.det(ends[1:] - ends[0]))))
 
 
 def map_in_map(a: MapFile, b: MapFile) -> Lies | None:
@@ -54,10 +56,11 @@ def map_in_map(a: MapFile, b: MapFile) -> Lies | None:
     b_H_a = _between(a, b)
     if b_H_a is None:
         return None
-    off = _SHARE * min(max(b.width, b.height), _size(b_H_a) * max(a.width, a.height))
+    size = _size(b_H_a, np.zeros(2))
+    off = _SHARE * min(max(b.width, b.height), size * max(a.width, a.height))
     if b.metres is not None:
         off = max(off, _POSITIONS_M / min(b.metres))
-    return Lies(b_H_a=b_H_a, off_px=off)
+    return Lies(b_H_a=b_H_a, off_px=off, off_a_px=off / size)
 
 
 def photo_in_map(photo: Photo, target: MapFile, off: float) -> Lies | None:
@@ -88,7 +91,8 @@ def photo_in_map(photo: Photo, target: MapFile, off: float) -> Lies | None:
     found = fit("homography", px, there)
     if found is None:
         return None
-    return Lies(b_H_a=found, off_px=off * max(photo.width, photo.height) * _size(found))
+    off_px = off * max(photo.width, photo.height)
+    return Lies(b_H_a=found, off_px=off_px * _size(found, middle), off_a_px=off_px)
 
 
 def shared_boxes(
