@@ -9,7 +9,7 @@ import pytest
 
 from skyquilt.engine.clock import result_of
 from skyquilt.settings import MosaicSettings
-from skyquilt.thermal.by_pairs import by_homographies, by_pairs, overlapping
+from skyquilt.thermal.by_pairs import by_homographies, by_pairs, overlapping, registered_of
 from skyquilt.workflows.mosaic import make_map
 from skyquilt.workflows.survey_input import read_input
 
@@ -73,3 +73,30 @@ def test_blocks_that_share_no_ground_are_refused(scene, other):
     far = other.aligned.alignment.frame.origin[0] + 5000
     found = by_pairs(scene, in_frame(other, (far, 0.0)))
     assert not found and found.reason.startswith("0 of 0 overlapping pairs")
+
+
+def tries(near, anywhere, count=24):
+    """What is found of pairs numbered 0 to `count`, and which are sought anywhere."""
+    sought = []
+
+    def far(k):
+        sought.append(k)
+        return f"far {k}" if k in anywhere else None
+
+    found = registered_of(
+        [(k,) for k in range(count)], lambda k: f"near {k}" if k in near else None, far
+    )
+    return found, sought
+
+
+def test_pairs_are_not_all_sought_everywhere():
+    """Flights over different places took 100 s: each of 24 pairs was sought in all directions."""
+    assert tries({3, 5, 11}, {4}) == (["near 3", "near 5", "near 11"], [])
+    found, sought = tries({3}, {4, 9})
+    assert found == ["near 3", "far 4", "far 9"] and sought == [k for k in range(24) if k != 3]
+    found, sought = tries((), ())
+    assert not found and len(sought) == 8 and {0, 23} <= set(sought)
+    found, sought = tries((), set(range(0, 24, 3)))
+    assert found == [f"far {k}" for k in range(0, 24, 3)] and sorted(sought) == list(range(24))
+    assert len(sought) == 24
+    assert tries((), (), count=0) == ([], []) and tries((), {0, 1}, count=2)[1] == [0, 1]

@@ -52,16 +52,20 @@ class Auto:
     """
     sure: float = 6.0
     """Agreement above which nothing else is tried."""
+    beyond: bool = True
+    """Whether everything is searched where a guess is not confirmed."""
     version: ClassVar[int] = 4
 
     def __call__(self, a: Picture, b: Picture, guess: Guess | None = None) -> Outcome:
         """The registration of b to a, or the reason why there is none.
 
-        A guess is tried first. If it is not confirmed, everything is searched, since metadata may
-        be wrong.
+        A guess is tried first. If it is not confirmed, everything is searched (if `beyond`), since
+        metadata may be wrong.
         """
-        if guess is not None and (found := self._guided(a, b, guess)):
-            return found
+        if guess is not None:
+            found = self._guided(a, b, guess)
+            if found or not self.beyond:
+                return found
         pictures = both_usable(a, b)
         if isinstance(pictures, RefusedRegistration):
             return pictures

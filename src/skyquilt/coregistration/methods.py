@@ -68,6 +68,11 @@ def auto() -> WithoutMarks:
     return WithoutMarks(method=Auto(propose=_proposals()))
 
 
+def near_guess() -> WithoutMarks:
+    """The same near a guess only, for pictures that are known to lie within its reach."""
+    return WithoutMarks(method=Auto(propose=_proposals(), beyond=False))
+
+
 def structure() -> WithoutMarks:
     """A structure descriptor alone, verified by patches."""
     return WithoutMarks(method=Structure(propose=_proposals()))
