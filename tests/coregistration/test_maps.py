@@ -14,9 +14,11 @@ from rasterio.transform import Affine
 from skyquilt.coregistration.pictures import common_parts, guess_of, open_picture
 from skyquilt.coregistration.places import photo_in_map
 from skyquilt.coregistration.usable import filled, usable
-from skyquilt.coregistration.workflow import outcome_of, register
+from skyquilt.coregistration.workflow import iter_register, outcome_of, register
+from skyquilt.errors import SideFileError
 from skyquilt.geometry.frames import cam_R_map_from_angles
 from skyquilt.geometry.transforms import transfer
+from skyquilt.model.event import StageStarted
 from skyquilt.model.photo import Attitude, Photo
 from skyquilt.model.registration import ErrorField, Picture, Registration
 from skyquilt.raster.read_map import MapFile
@@ -442,3 +444,20 @@ def test_a_photo_of_a_tenth_of_a_map_is_found(tmp_path):
     px = np.array([[420, 610, 1], [460, 580, 1], [400, 650, 1.0]])
     there, right = px @ found.b_H_a.T, px @ truth.T
     assert np.abs(there[:, :2] / there[:, 2:] - right[:, :2]).max() < 0.8
+
+
+def test_a_map_that_is_damaged_or_gone_at_full_size_is_told(scene, tmp_path):
+    """Its overview is enough for the registration; the drawing ended in a traceback."""
+    path, b = scene
+    torn = write(tmp_path / "b.tif", b, place_b(), nodata=0)
+    opened = open_picture(torn)
+    values, valid = opened.window(0, 0, 9, 7)
+    assert (values == b[:9, :7]).all() and (valid == (b[:9, :7] > 0)).all()
+    torn.write_bytes(torn.read_bytes()[:2000])
+    with pytest.raises(SideFileError, match=r"b\.tif cannot be read at full size"):
+        opened.window(100, 0, 200, 300)
+    events = iter_register(path, write(tmp_path / "c.tif", b, place_b(), nodata=0), tmp_path / "o")
+    with pytest.raises(SideFileError, match=r"c\.tif cannot be read at full size"):
+        for event in events:
+            if isinstance(event, StageStarted) and event.stage == "draw":
+                (tmp_path / "c.tif").unlink()

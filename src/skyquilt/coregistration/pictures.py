@@ -4,6 +4,7 @@ that metadata or georeferencing give.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from math import cos, hypot, radians, sin
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from skyquilt.coregistration.candidates import middle, similarity
 from skyquilt.coregistration.places import Lies, map_in_map, photo_in_map, shared_boxes
-from skyquilt.errors import UnreadablePhotoError, UsageError
+from skyquilt.errors import SideFileError, UnreadablePhotoError, UsageError
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.registration import Guess, Matrix, Picture
 from skyquilt.photos.pixels import read_color
@@ -188,8 +189,23 @@ def _of_map(place: MapFile) -> Source:
         place=place,
         picture=picture,
         full_S_picture=full,
-        window=lambda row, column, height, width: read_window(place, row, column, height, width),
+        window=partial(_window, place),
     )
+
+
+def _window(
+    place: MapFile, row: int, column: int, height: int, width: int
+) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """Pixels and validity at full size, of which some may be damaged that the image, read from an
+    overview, does not show.
+
+    Raises:
+        SideFileError: they cannot be read.
+    """
+    try:
+        return read_window(place, row, column, height, width)
+    except OSError as error:
+        raise SideFileError(f"{place.path.name} cannot be read at full size: {error}") from error
 
 
 def _part(place: MapFile, part: tuple[int, int, int, int]) -> tuple[Picture, Matrix]:
