@@ -245,6 +245,9 @@ def test_degrees_of_equal_size_are_not_as_wide_as_high(tmp_path, shift):
     write(tmp_path / "b.tif", b, Affine.translation(shift, 0) @ place, "EPSG:4326")
     record = register(tmp_path / "a.tif", tmp_path / "b.tif", tmp_path / "out").metrics
     assert (record["guess"] is None) == bool(shift)
+    assert record["model"] == "affine"
+    assert record["beside_m"] == pytest.approx(shift * 78_640, abs=1.0)
+    assert ("1.6 km apart" in record["reason"]) == bool(shift)
     px, there = places_of("EPSG:4326", place)
     found = np.c_[px, np.ones(9)] @ np.array(record["b_H_a"]).T
     assert np.abs(found[:, :2] / found[:, 2:] - there).max() < 0.6
@@ -461,3 +464,16 @@ def test_a_map_that_is_damaged_or_gone_at_full_size_is_told(scene, tmp_path):
         for event in events:
             if isinstance(event, StageStarted) and event.stage == "draw":
                 (tmp_path / "c.tif").unlink()
+
+
+def test_a_map_too_large_to_be_reduced_is_refused_at_once(scene, tmp_path):
+    """Its pixels would be read for many minutes. The file itself is small: it holds no tile."""
+    path, _ = scene
+    about = {"width": 400_000, "height": 300_000, "count": 1, "crs": "EPSG:32633"}
+    about |= {"tiled": True, "blockxsize": 8192, "blockysize": 8192, "sparse_ok": True}
+    about |= {"transform": PLACE_A, "dtype": "float32", "bigtiff": "YES"}
+    with rasterio.open(tmp_path / "b.tif", "w", driver="GTiff", **about):
+        pass
+    assert (tmp_path / "b.tif").stat().st_size < 100_000
+    record = register(path, tmp_path / "b.tif", tmp_path / "out").metrics
+    assert "400000 x 300000 px and no overviews" in record["reason"]

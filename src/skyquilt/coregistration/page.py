@@ -124,12 +124,21 @@ def _transform(record: Mapping[str, Any]) -> tuple[Table | Sentences, ...]:
     said = (
         "From pixels of A (x right, y down, centres at integers) to pixels of B; a"
         f" {record['model']}.",
-        f"Scale {fixed(scale, 4)}, rotation {fixed(turn, 2)} degrees clockwise.",
+        "It mirrors: rows of one of the files run from south to north."
+        if np.linalg.det(m[:2, :2]) < 0
+        else f"Scale {fixed(scale, 4)}, rotation {fixed(turn, 2)} degrees clockwise.",
         f"Guess from {record['guess']}." if record["guess"] else "There was no guess.",
+        *_beside(record),
     )
     return Sentences(items=said), Table(
         title="b_H_a", head=("", "", ""), rows=rows, numeric="nnn", wide=False
     )
+
+
+def _beside(record: Mapping[str, Any]) -> tuple[str, ...]:
+    """What the place of B in its own file is worth."""
+    off = record.get("beside_m")
+    return () if off is None else (f"By its own file, the middle of B lies {off:.1f} m beside.",)
 
 
 def _evidence(record: Mapping[str, Any]) -> Table | Sentences:

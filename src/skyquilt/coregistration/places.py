@@ -95,6 +95,30 @@ def photo_in_map(photo: Photo, target: MapFile, off: float) -> Lies | None:
     return Lies(b_H_a=found, off_px=off_px * _size(found, middle), off_a_px=off_px)
 
 
+def beside_m(a: MapFile, b: MapFile, b_H_a: Matrix) -> float | None:
+    """How far in m the middle of b lies, by its own file, from where a registration puts it on a;
+    None if a file tells no place on Earth.
+    """
+    from pyproj import Geod, Transformer
+    from pyproj.exceptions import CRSError, ProjError
+
+    if a.crs is None or b.crs is None:
+        return None
+    px_b = np.array([[(b.width - 1) / 2, (b.height - 1) / 2]])
+    px_a = transfer(np.asarray(np.linalg.inv(b_H_a), np.float64), px_b)
+    ends = []
+    for place, px in ((a, px_a), (b, px_b)):
+        try:
+            onto = Transformer.from_crs(place.crs, "EPSG:4326", always_xy=True)
+        except (CRSError, ProjError):
+            return None
+        ends += [float(v[0]) for v in onto.transform(*_on_ground(place, px))]
+    if not np.isfinite(ends).all():
+        return None
+    lon_a, lat_a, lon_b, lat_b = ends
+    return float(Geod(ellps="WGS84").inv(lon_a, lat_a, lon_b, lat_b)[2])
+
+
 def shared_boxes(
     lies: Lies, frame_a: tuple[int, int], frame_b: tuple[int, int]
 ) -> tuple[Box | None, Box | None]:

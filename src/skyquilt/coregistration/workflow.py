@@ -16,6 +16,7 @@ import numpy as np
 from skyquilt.coregistration.files import CONTRACT, draw, page
 from skyquilt.coregistration.methods import RegisterSettings, registration_method
 from skyquilt.coregistration.pictures import Source, common_parts, guess_of, open_picture
+from skyquilt.coregistration.places import beside_m
 from skyquilt.coregistration.stated_error import StatedError, state_error, tolerated
 from skyquilt.engine.clock import cpu_seconds
 from skyquilt.engine.folder import claimed
@@ -28,6 +29,8 @@ from skyquilt.raster.atomic import write_text
 from skyquilt.typed import as_path, instance
 from skyquilt.version import __version__
 
+FAR_M = 100.0
+"""Distance in m of a map from its place that a note tells: more than any receiver is off."""
 STAGES = ("read", "register", "draw")
 """Stages in order; a refusal has nothing to draw."""
 
@@ -40,6 +43,8 @@ class _Told:
     stated: StatedError | None
     guess: Guess | None
     cpu_s: float
+    beside_m: float | None = None
+    """How far in m B lies beside its place by its own file."""
 
 
 def iter_register(
@@ -73,6 +78,7 @@ def iter_register(
         record |= {
             "a": str(a),
             "b": str(b),
+            "beside_m": None if told.beside_m is None else round(told.beside_m, 2),
             "cpu_seconds": round(told.cpu_s, 3),
             "version": __version__,
         }
@@ -115,6 +121,8 @@ def outcome_of(a: Source, b: Source, method: str, guess: Guess | None) -> Outcom
     full_a, full_b = a.full_S_picture, b.full_S_picture
     matrix = full_b @ outcome.b_H_a @ np.linalg.inv(full_a)
     error = outcome.error and outcome.error.seen_in(full_b)
+    if outcome.model == "similarity" and not _similar(matrix):
+        outcome = replace(outcome, model="affine")  # of files whose pixels are longer than wide
     if _same(a, b):
         outcome = replace(
             outcome,
@@ -226,7 +234,29 @@ def _told(
     outcome, stated = within_tolerance(
         _of_files(a, b, settings.method, guess), a, b, settings.tolerance_px
     )
-    return _Told(outcome=outcome, stated=stated, guess=guess, cpu_s=cpu_seconds() - since)
+    beside = None
+    if isinstance(outcome, Registration) and a.place and b.place:
+        beside = beside_m(a.place, b.place, outcome.b_H_a)
+        if beside is not None and beside > FAR_M and not outcome.note:
+            outcome = replace(
+                outcome,
+                note=f"By what the files say the maps lie {_length(beside)} apart; the registration"
+                " is by their pictures alone, so check that both show the same place.",
+            )
+    return _Told(
+        outcome=outcome, stated=stated, guess=guess, cpu_s=cpu_seconds() - since, beside_m=beside
+    )
+
+
+def _length(metres: float) -> str:
+    return f"{metres / 1000:.1f} km" if metres >= 1000 else f"{metres:.0f} m"
+
+
+def _similar(matrix: np.ndarray) -> bool:
+    """Whether a transform keeps shapes, mirrored or not."""
+    x, y = matrix[:2, 0], matrix[:2, 1]
+    size = max(float(x @ x), float(y @ y))
+    return abs(float(x @ x - y @ y)) < 0.01 * size and abs(float(x @ y)) < 0.01 * size
 
 
 def _same(a: Source, b: Source) -> bool:

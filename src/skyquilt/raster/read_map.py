@@ -19,6 +19,8 @@ FILLS = (-9999.0, -10000.0, -32767.0, -32768.0, -99999.0)
 """Values with which programs fill pixels that have none, often without stating it."""
 LARGEST = 1e30
 """Values beyond this are fillings, too."""
+MOST_READ = 40_000_000_000
+"""Most pixels that are read to reduce them, some minutes; more need overviews."""
 _LOOKED = 1024
 """Longer side in px at which a file is searched for values that may be fillings."""
 _FINER = 2
@@ -55,6 +57,8 @@ class MapFile:
     """Stored value of pixels without data; found in the pixels where the file states none."""
     masked: bool = False
     """Whether the file itself says which pixels have data."""
+    overviews: bool = False
+    """Whether the file holds reduced copies of itself."""
     beside: bool = False
     """Whether control points, or a file beside it, place it."""
 
@@ -117,6 +121,7 @@ def open_map(path: Path) -> MapFile | None:
                 palette=palette,
                 nodata=_nodata(raster),
                 masked=_masked(raster),
+                overviews=bool(raster.overviews(1)),
                 beside=raster.crs is None or raster.transform.is_identity,
             )
     except (rasterio.errors.RasterioError, UnicodeDecodeError):
@@ -155,7 +160,8 @@ def _nodata(raster: "DatasetReader") -> float | None:
     """The stated value, or one of `FILLS` that occurs in the first band."""
     import rasterio
 
-    if _masked(raster) or np.dtype(raster.dtypes[0]).kind not in "if":
+    known = _masked(raster) or np.dtype(raster.dtypes[0]).kind not in "if"
+    if known or (raster.width * raster.height > MOST_READ and not raster.overviews(1)):
         return None if raster.nodata is None else float(raster.nodata)
     factor = max(1.0, max(raster.width, raster.height) / _LOOKED)
     shape = (max(1, round(raster.height / factor)), max(1, round(raster.width / factor)))
@@ -222,6 +228,11 @@ def _read(
 
     if source.stored.startswith("complex"):
         raise OSError("its pixels are complex numbers; make a map of their amounts first")
+    if not source.overviews and window.width * window.height > MOST_READ:
+        raise OSError(
+            f"it has {source.width} x {source.height} px and no overviews; add them (for instance"
+            " with gdaladdo), or cut out the part that is needed"
+        )
     own = source.palette is not None or (source.nodata is not None and not source.masked)
     full = (round(window.height), round(window.width))
     finer = tuple(min(f, _FINER * s) for f, s in zip(full, shape, strict=True)) if own else shape
