@@ -11,6 +11,7 @@ from pyproj import CRS, Transformer
 from rasterio.control import GroundControlPoint
 from rasterio.transform import Affine
 
+from skyquilt.coregistration.files import overlays
 from skyquilt.coregistration.pictures import common_parts, guess_of, open_picture
 from skyquilt.coregistration.places import photo_in_map
 from skyquilt.coregistration.usable import filled, usable
@@ -477,3 +478,27 @@ def test_a_map_too_large_to_be_reduced_is_refused_at_once(scene, tmp_path):
     assert (tmp_path / "b.tif").stat().st_size < 100_000
     record = register(path, tmp_path / "b.tif", tmp_path / "out").metrics
     assert "400000 x 300000 px and no overviews" in record["reason"]
+
+
+def test_what_b_does_not_show_hides_nothing_of_a(scene, tmp_path):
+    """Where b had no data, the pictures for display were black."""
+    path, b = scene
+    b = b.copy()
+    b[:, 200:330] = 0
+    one, other = open_picture(path), open_picture(write(tmp_path / "b.tif", b, place_b(), nodata=0))
+    none = np.zeros((0, 2))
+    found = Registration(model="similarity", b_H_a=TRUTH, px_a=none, px_b=none)
+    _, checks, _, mixed = overlays(one, other, found)
+    hole = cv2.warpPerspective(
+        np.where(b == 0, 255, 0).astype(np.uint8),
+        TRUTH,
+        SHAPE[::-1],
+        flags=cv2.WARP_INVERSE_MAP | cv2.INTER_NEAREST,
+        borderValue=255,
+    )
+    inside = cv2.erode(hole, np.ones((5, 5))) > 0
+    assert inside.mean() > 0.3
+    for picture in (checks, mixed):
+        grey = picture[..., 0].astype(int)
+        shown = one.picture.values[inside].astype(int)
+        assert np.corrcoef(grey[inside], shown)[0, 1] > 0.95

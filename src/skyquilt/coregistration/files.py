@@ -128,13 +128,13 @@ def draw(output: Path, a: Source, b: Source, outcome: Registration) -> None:
 
 def overlays(a: Source, b: Source, outcome: Registration) -> list[NDArray[np.uint8]]:
     """RGB images in the order of `OVERLAYS`, reduced to `LONGEST_SHOWN`."""
-    small_a, a_S = _reduced(a)
-    small_b, b_S = _reduced(b)
+    small_a, _, a_S = _reduced(a)
+    small_b, there_is, b_S = _reduced(b)
     there = b_S @ outcome.b_H_a @ np.linalg.inv(a_S)
     size = (small_a.shape[1], small_a.shape[0])
     back = cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR
     moved = np.asarray(cv2.warpPerspective(small_b, there, size, flags=back), np.uint8)
-    seen = np.asarray(cv2.warpPerspective(np.ones_like(small_b), there, size, flags=back)) > 0
+    seen = np.asarray(cv2.warpPerspective(there_is, there, size, flags=back)) > 127
     lines = side_by_side(small_a, small_b, _apply(a_S, outcome.px_a), _apply(b_S, outcome.px_b))
     return [
         lines,
@@ -176,7 +176,7 @@ def _error_picture(a: Source, b: Source, outcome: Registration, tolerance: float
     """The error map in colours over A (RGB), in a list; none if the method states no error."""
     if outcome.error is None:
         return []
-    grey, _ = _reduced(a)
+    grey, _, _ = _reduced(a)
     step = max(a.height, a.width) / max(grey.shape)
     bound = error_map(outcome, (a.height, a.width), (b.height, b.width), step)
     fine = cv2.resize(bound, (grey.shape[1], grey.shape[0]), interpolation=cv2.INTER_NEAREST)
@@ -201,8 +201,10 @@ def page(
     return registration_page(record, pictures)
 
 
-def _reduced(source: Source) -> tuple[NDArray[np.uint8], Matrix]:
-    """Grey image for display, and the transform from the file's pixels to its pixels."""
+def _reduced(source: Source) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Matrix]:
+    """Grey image for display, where it has content (255), and the transform from the file's pixels
+    to its pixels.
+    """
     values = source.picture.values
     valid = source.picture.valid
     if valid is None:
@@ -213,7 +215,9 @@ def _reduced(source: Source) -> tuple[NDArray[np.uint8], Matrix]:
     small = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
     x, y = size[0] / grey.shape[1], size[1] / grey.shape[0]
     shrinking = np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]])
-    return small, shrinking @ np.linalg.inv(source.full_S_picture)
+    inside = np.where(valid, 255, 0).astype(np.uint8)
+    inside = np.asarray(cv2.resize(inside, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return small, inside, shrinking @ np.linalg.inv(source.full_S_picture)
 
 
 def _apply(matrix: NDArray[Any], px: NDArray[Any]) -> NDArray[Any]:
