@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skyquilt.alignment.conflicts import conflicts
-from skyquilt.alignment.headings import common_error_deg
+from skyquilt.alignment.start import common_error_deg
 from skyquilt.geometry.frames import angle_difference_deg, angles_from_cam_R_map
 from tests.alignment.test_bundle import Flown, relative_error
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from skyquilt.alignment.headings import GROSS_DEG, common_error_deg
+from skyquilt.alignment.start import GROSS_DEG, common_error_deg
 from skyquilt.geometry.camera import distort
 from skyquilt.geometry.frames import angle_difference_deg, angles_from_cam_R_map
 from skyquilt.model.camera import Camera

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.headings import GROSS_DEG, steered
 from skyquilt.alignment.motion import velocities
 from skyquilt.alignment.problem import PART, READOUT, Problem, State
-from skyquilt.alignment.start import Start
+from skyquilt.alignment.start import GROSS_DEG, Start, steered
 from skyquilt.alignment.tracks import Tracks
 from skyquilt.alignment.triangulate import intersect
 from skyquilt.geometry.camera import tangent_over_angle

@@ -16,8 +16,6 @@ from skyquilt.model.features import Features
 from skyquilt.model.photo import evenly
 
 Mask = NDArray[np.bool_]
-SHIFTS = ((23, 0), (0, 19), (-17, 14), (13, -29))
-"""Shifts (x, y) in px at which nothing but chance makes pictures alike."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -84,6 +82,10 @@ class FindFixedMarks:
     """And so many times as many as others show where the picture is shifted: rows of plants or
     panels look alike wherever one lies on another.
     """
+    shifts: tuple[tuple[int, int], ...] = ((23, 0), (0, 19), (-17, 14), (13, -29))
+    """Shifts (x, y) in px of the image that was searched, at which only chance makes pictures
+    alike.
+    """
     cell_px: int = 4
     """Side of a cell of a mask, in px of the image that was searched for features."""
 
@@ -124,7 +126,7 @@ class FindFixedMarks:
         fixed = self._agreed(photos, alike, apart)
         if not fixed:
             return [np.zeros(len(one), bool) for one in photos]
-        shifted = [self._agreed(photos, self._alike(photos, by), apart) for by in SHIFTS]
+        shifted = [self._agreed(photos, self._alike(photos, by), apart) for by in self.shifts]
         places = [
             sum(_places(photos[a], mask, self.cell_px) for a, mask in some.items())
             for some in (fixed, *shifted)
