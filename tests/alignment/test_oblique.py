@@ -5,7 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skyquilt.alignment.aligners import shown_already, with_loose_photos, without_strange_blocks
+from skyquilt.alignment.aligners import (
+    share_shown,
+    shown_already,
+    with_loose_photos,
+    without_strange_blocks,
+)
 from skyquilt.alignment.determined import deviation_px, weak_photos
 from skyquilt.alignment.dominant_plane import dominant_normal, levelled
 from skyquilt.alignment.inputs import AlignmentInputs
@@ -202,7 +207,12 @@ def test_a_photo_without_links_is_not_drawn_over_what_others_show():
     assert shown_already(pose(0, 0), CAMERA, done)
     assert shown_already(pose(70, 0, z=-1.0), CAMERA, done)  # taken on the ground
     assert not shown_already(pose(75, 0), CAMERA, done)
-    assert not shown_already(pose(0, 0, z=200.0), CAMERA, done)
+    # what is far aside is not shown, though a polynomial of the lens folds it into the picture
+    folding = replace(CAMERA, k1=-0.0092, k2=0.0231, k3=-0.0366)
+    lens = replace(done, cameras=dict.fromkeys(done.cameras, folding))
+    assert share_shown(pose(0, 0), folding, lens, lens.held) > 0.95
+    ring = [pose(x, y) for x in (-160, -120, 0, 120, 160) for y in (-160, -120, 120, 160)]
+    assert max(share_shown(p, folding, lens, lens.held) for p in ring) == 0
 
 
 @pytest.mark.parametrize(("away_m", "left_out"), [(0.0, True), (15.0, True), (70.0, False)])

@@ -16,6 +16,7 @@ from skyquilt.geometry.camera import (
     project,
     project_with_derivatives,
     rays,
+    shown,
     undistort,
 )
 from skyquilt.model.camera import Camera
@@ -177,3 +178,31 @@ def test_distortion_grows_up_to_that_radius_and_hardly_beyond(camera):
         assert np.diff(step)[0] <= 0.051e-6
     mirror = Camera.ideal(width=10, height=10, focal=10)
     assert monotone_radius(mirror) == 3.0
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        {},
+        {"k1": -0.2, "k2": 0.06},
+        {"k1": -0.0092, "k2": 0.0231, "k3": -0.0366},  # as adjusted: folds back at 1.3
+        {"k1": 0.02, "p1": 1e-3, "p2": -1e-3},
+        {"fisheye": 1.0, "k1": -0.03},
+    ],
+)
+def test_what_a_picture_shows_lies_on_the_rays_of_its_pixels(lens):
+    """Points far aside, that a polynomial folds into the picture, do not."""
+    camera = replace(Camera.ideal(width=800, height=600, focal=500.0), **lens)
+    rng = np.random.default_rng(0)
+    xyz = rng.uniform(-1, 1, (20000, 3)) * [4, 4, 1]
+    px, there = shown(camera, xyz)
+    assert 50 < there.sum() < 2000 and (xyz[there, 2] > 0).all()
+    back = rays(camera, px[there])
+    back /= np.linalg.norm(back, axis=1, keepdims=True)
+    true = xyz[there] / np.linalg.norm(xyz[there], axis=1, keepdims=True)
+    np.testing.assert_allclose(back, true, atol=1e-5)
+    column, row = np.meshgrid(np.arange(1, 799, 40.0), np.arange(1, 599, 40.0))
+    inside = np.column_stack([column.ravel(), row.ravel()])
+    px, there = shown(camera, 7.0 * rays(camera, inside))
+    assert there.all()
+    np.testing.assert_allclose(px, inside, atol=0.01)

@@ -20,7 +20,7 @@ from skyquilt.alignment.pose import ByMetadata, ByPose
 from skyquilt.alignment.repair import Repaired, repair
 from skyquilt.alignment.start import ground_of
 from skyquilt.errors import AlignmentError
-from skyquilt.geometry.camera import project
+from skyquilt.geometry.camera import shown
 from skyquilt.geometry.frames import cam_R_map_from_angles
 from skyquilt.model.camera import Camera
 from skyquilt.model.features import Features
@@ -59,7 +59,7 @@ class ByLinks:
 
     bundle: Bundle = field(default_factory=Bundle)
     """The adjustment."""
-    version: ClassVar[int] = 11
+    version: ClassVar[int] = 12
     needs_links: ClassVar[bool] = True
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -129,7 +129,7 @@ class Auto:
     """For linked photos."""
     pose: ByReport
     """For photos that only have positions."""
-    version: ClassVar[int] = 11
+    version: ClassVar[int] = 12
     needs_links: ClassVar[bool] = True
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -315,13 +315,10 @@ def share_shown(pose: Pose, camera: Camera, alignment: Alignment, by: Sequence[i
         return 0.0
     held = np.array(by)
     away = [float(np.hypot(*(alignment.poses[i].map_C - pose.map_C)[:2])) for i in held.tolist()]
-    shown = np.zeros(len(places), np.bool_)
+    there = np.zeros(len(places), np.bool_)
     for i in held[np.argsort(away)[:NEIGHBOURS]].tolist():
-        own, local = alignment.camera(i), alignment.poses[i].to_camera(places)
-        ahead = local[:, 2] > 0
-        px = project(own, np.where(ahead[:, None], local, [0.0, 0.0, 1.0]))
-        shown |= ahead & ((px > 0) & (px < [own.width - 1, own.height - 1])).all(1)
-    return float(shown.mean())
+        there |= shown(alignment.camera(i), alignment.poses[i].to_camera(places))[1]
+    return float(there.mean())
 
 
 def _lacking(C: NDArray[np.float64], prior: Prior) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.oblique import without_photos
-from skyquilt.geometry.camera import project
+from skyquilt.geometry.camera import shown
 from skyquilt.model.poses import Alignment
 
 SAME_PLACE = 0.03
@@ -57,10 +57,8 @@ def _copied(found: Alignment, i: int, told: Sequence[int], names: Sequence[str])
 def _else(found: Alignment, i: int) -> str:
     """Why a picture shows something else than the ground in large parts; empty if it does not."""
     camera, ties = found.camera(i), found.ties
-    local = found.poses[i].to_camera(ties.xyz)
-    px = project(camera, np.where(local[:, 2:] > 0, local, [0.0, 0.0, 1.0]))
+    px, inside = shown(camera, found.poses[i].to_camera(ties.xyz))
     size = np.array([camera.width, camera.height])
-    inside = (local[:, 2] > 0) & ((px > 0) & (px < size - 1)).all(1)
     there = np.bincount(_cells(px[inside], size), minlength=CELLS**2)
     own = np.bincount(_cells(ties.px[ties.photo == i], size), minlength=CELLS**2)
     judged = there >= FEWEST

@@ -211,3 +211,15 @@ def monotone_radius(camera: Camera) -> float:
     folded = np.flatnonzero(slope <= 0.05)
     limit = float(r[folded[0]]) if len(folded) else most
     return float(np.tan(limit)) if camera.fisheye else limit
+
+
+def shown(camera: Camera, xyz_cam: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Pixels (N, 2) of points (N, 3) in camera coordinates, and which of them (N,) the picture
+    shows: those in front of the camera, inside its rim, and not folded into it by the distortion.
+    """
+    ahead = xyz_cam[:, 2] > 0
+    local = np.where(ahead[:, None], xyz_cam, [0.0, 0.0, 1.0])
+    px = project(camera, local)
+    near = np.hypot(local[:, 0], local[:, 1]) <= monotone_radius(camera) * local[:, 2]
+    inside = ((px > 0) & (px < (camera.width - 1, camera.height - 1))).all(1)
+    return px, np.asarray(ahead & near & inside)
