@@ -85,10 +85,16 @@ def _elsewhere(
     few = count < min(AGAINST, OF_USUAL * float(np.median(count)))
     elsewhere = few & (away > ELSEWHERE * sigma) & (away > ELSEWHERE_HIGH * high)
     return {
-        own[k]: f"it has only {count[k]} tie points, by which it would lie {away[k]:.0f} m from its"
-        " reported position: matches of places that look alike"
-        for k in np.flatnonzero(elsewhere)
+        own[k]: elsewhere_reason(int(count[k]), float(away[k])) for k in np.flatnonzero(elsewhere)
     }
+
+
+def elsewhere_reason(points: int, away_m: float) -> str:
+    """Why a photo is not believed to lie where a few tie points place it."""
+    return (
+        f"it has only {points} tie points, by which it would lie {away_m:.0f} m from its reported"
+        " position: matches of places that look alike"
+    )
 
 
 def _left_out(

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.aligners import ONE_TONE
 from skyquilt.alignment.bundle import Bundle
+from skyquilt.alignment.determined import AGAINST, ELSEWHERE, ELSEWHERE_HIGH, elsewhere_reason
 from skyquilt.alignment.local_adjustment import AdjustedWindow, LocalAdjustment, Window
 from skyquilt.errors import AlignmentError, UnreadablePhotoError
 from skyquilt.live.drone_metadata import Metadata
@@ -26,6 +27,14 @@ RING = 8
 MOVING = 2
 """Number of linked photos that are adjusted together with a new one."""
 NO_MAP = "no photo has a position so far, and too few overlap for a map without a place"
+MISLED = (
+    "by its matches the photos around it would lie elsewhere than their positions: they are of"
+    " places that look alike"
+)
+FEWEST_TOLD, WORSE, WORSE_HIGH = 3, 3.0, 0.1
+"""Photos of the map whose positions tell that; how many times further from them they would lie, in
+the mean, than before, and than positions err; and by which share of the flying height.
+"""
 NOT_ON_MAP = "it overlaps other photos, but none that is on the map"
 
 
@@ -45,6 +54,8 @@ class Change:
     """(P, 3) ground points in m."""
     reason: str = ""
     """Why the links do not determine the photo's pose; empty if they do."""
+    observations: int = 0
+    """Tie points of the photo; 0 = not told."""
 
 
 class LocalPose:
@@ -98,6 +109,48 @@ class LocalPose:
         links: dict[tuple[int, int], Link | None],
         good: dict[tuple[int, int], Link],
     ) -> Change:
+        change = self._pose_by(member, links, good)
+        why = self._misled(member, change)
+        return _unmoved(links | dict.fromkeys(good, None), why) if why else change
+
+    def _misled(self, member: Member, change: Change) -> str:
+        """Why the photo's matches are taken for ones of places that look alike: few of them place
+        it elsewhere than its position, or they move those on the map away from positions with which
+        they agreed. Empty if they are believed.
+        """
+        told = [
+            (m.prior, m.pose, pose)
+            for i, pose in change.moved.items()
+            if i != member.id
+            and (m := self.members.by_id[i]).pose is not None
+            and np.isfinite(m.prior.map_C[:2]).all()
+        ]
+        if len(told) < FEWEST_TOLD:
+            return ""
+        priors, old, new = zip(*told, strict=True)
+        place = np.array([p.map_C[:2] for p in priors])
+        before, after = (np.array([p.map_C[:2] for p in poses]) - place for poses in (old, new))
+        was, now = (float(np.linalg.norm(d, axis=1).mean()) for d in (before, after))
+        usual = max(was, float(np.median([p.sigma_C[0] for p in priors])))
+        middle = np.mean([p.map_C for p in new], axis=0)
+        high = max(float(middle[2]) - self.metadata.ground_at(middle), 1.0)
+        if now > WORSE * usual and now - was > WORSE_HIGH * high:
+            return MISLED
+        own = change.moved.get(member.id)
+        if own is None or not 0 < change.observations < AGAINST:
+            return ""
+        off = (own.map_C - member.prior.map_C)[:2] - np.median(after, axis=0)
+        away, sigma = float(np.linalg.norm(off)), max(usual, float(member.prior.sigma_C[0]))
+        if not away > max(ELSEWHERE * sigma, ELSEWHERE_HIGH * high):  # also without a position
+            return ""
+        return elsewhere_reason(change.observations, away)
+
+    def _pose_by(
+        self,
+        member: Member,
+        links: dict[tuple[int, int], Link | None],
+        good: dict[tuple[int, int], Link],
+    ) -> Change:
         whole = {member.id}
         for a, _ in good:
             whole |= self.members.block(a)
@@ -114,6 +167,7 @@ class LocalPose:
                     links=links,
                     xyz=done.ties.xyz,
                     reason=done.rejected.get(ids.index(member.id), ""),
+                    observations=int((done.ties.photo == ids.index(member.id)).sum()),
                 )
         return self._adjusted_locally(member, links, good)
 
@@ -174,7 +228,14 @@ class LocalPose:
             links[ids[key[0]], ids[key[1]]] = None
         moved = {ids[k]: p for k, p in done.poses.items()}
         camera_of = {i: self.members.by_id[i].camera for i in moved} | {member.id: done.camera}
-        return Change(moved=moved, cameras={}, camera_of=camera_of, links=links, xyz=done.xyz)
+        return Change(
+            moved=moved,
+            cameras={},
+            camera_of=camera_of,
+            links=links,
+            xyz=done.xyz,
+            observations=done.observations,
+        )
 
     def window(
         self, member: Member, ids: Sequence[int], held: frozenset[int], more: Sequence[Link]
