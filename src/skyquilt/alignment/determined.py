@@ -83,10 +83,17 @@ def _elsewhere(
     high = np.array([alignment.poses[i].map_C[2] - ground for i in own])
     count = np.array([len(rows) for rows in map(ties.of_photos(block).__getitem__, own)])
     few = count < min(AGAINST, OF_USUAL * float(np.median(count)))
-    elsewhere = few & (away > ELSEWHERE * sigma) & (away > ELSEWHERE_HIGH * high)
+    elsewhere = few & lies_elsewhere(away, sigma, high)
     return {
         own[k]: elsewhere_reason(int(count[k]), float(away[k])) for k in np.flatnonzero(elsewhere)
     }
+
+
+def lies_elsewhere(away_m: Array, sigma_m: Array, high_m: Array) -> NDArray[np.bool_]:
+    """Whether positions that are so far away from where photos of a flying height lie, and have
+    these deviations, contradict them grossly.
+    """
+    return np.asarray(away_m > np.maximum(ELSEWHERE * sigma_m, ELSEWHERE_HIGH * high_m))
 
 
 def elsewhere_reason(points: int, away_m: float) -> str:

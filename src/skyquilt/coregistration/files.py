@@ -313,10 +313,8 @@ def _vrt(a: Source, b: Source, b_H_a: Matrix) -> str:
     x, y = np.meshgrid(ends * (b.width - 1), ends * (b.height - 1))
     px_b = np.c_[x.ravel(), y.ravel()]
     px_a = _apply(np.linalg.inv(b_H_a), px_b) + 0.5
-    m = a.place.affine if a.place else (1.0, 0.0, 0.0, 0.0, -1.0, 0.0)
-    ground = np.c_[
-        m[0] * px_a[:, 0] + m[1] * px_a[:, 1] + m[2], m[3] * px_a[:, 0] + m[4] * px_a[:, 1] + m[5]
-    ]
+    column, row = px_a.T
+    ground = np.column_stack(a.place.ground(column, row) if a.place else (column, -row))
     values = b.picture.values
     bands, dtype = 3 if values.ndim == 3 else 1, values.dtype.name
     if b.place:  # as in the file, not as read

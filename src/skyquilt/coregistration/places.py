@@ -11,10 +11,8 @@ from skyquilt.geometry.frames import ned_from_body
 from skyquilt.geometry.transforms import fit, transfer
 from skyquilt.model.photo import Photo
 from skyquilt.model.registration import Matrix
-from skyquilt.raster.read_map import MapFile
+from skyquilt.raster.read_map import Box, MapFile, part_between
 
-Box = tuple[int, int, int, int]
-"""Row, column, height and width of a part of a file in px."""
 _EARTH_M = 6378137.0
 _SHARE = 0.1
 """Largest error of the places of two maps, as a share of the smaller one's longer side, ..."""
@@ -135,11 +133,7 @@ def box(px: NDArray[np.float64], margin: float, size: tuple[int, int]) -> Box | 
     """Row, column, height and width of the part of a file of `size` (width, height) on which px
     (n, 2) lie, widened by a margin; None if there is none.
     """
-    low = np.clip(np.floor(px.min(0) - margin), 0, size).astype(int)
-    high = np.clip(np.ceil(px.max(0) + margin) + 1, 0, size).astype(int)
-    if (high - low < 1).any():
-        return None
-    return int(low[1]), int(low[0]), int(high[1] - low[1]), int(high[0] - low[0])
+    return part_between(px.min(0) - margin, px.max(0) + margin + 1, size)
 
 
 def _between(a: MapFile, b: MapFile) -> Matrix | None:
@@ -160,7 +154,7 @@ def _between(a: MapFile, b: MapFile) -> Matrix | None:
     return np.vstack([linear.T, [0, 0, 1.0]])
 
 
-def _grid(part: tuple[int, int, int, int]) -> NDArray[np.float64]:
+def _grid(part: Box) -> NDArray[np.float64]:
     """(9, 2) px over a part (row, column, height, width) with its corners."""
     row, column, height, width = part
     x, y = np.meshgrid([0, width / 2, width], [0, height / 2, height])
@@ -188,12 +182,9 @@ def _places(
             x, y = Transformer.from_crs(one, other, always_xy=True).transform(x, y)
         except (CRSError, ProjError):  # one is local, and nothing leads from it to the other
             return None
-    p, q, c, r, s, f = target.affine
-    there = np.linalg.solve(np.array([[p, q], [r, s]]), np.array([x - c, y - f])).T - 0.5
-    return np.asarray(there, np.float64) if np.isfinite(there).all() else None
+    there = target.pixel(x, y).T - 0.5
+    return there if np.isfinite(there).all() else None
 
 
 def _on_ground(place: MapFile, px: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    a, b, c, d, e, f = place.affine
-    column, row = px[:, 0] + 0.5, px[:, 1] + 0.5
-    return a * column + b * row + c, d * column + e * row + f
+    return place.ground(px[:, 0] + 0.5, px[:, 1] + 0.5)

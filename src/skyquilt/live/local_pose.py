@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.aligners import ONE_TONE
 from skyquilt.alignment.bundle import Bundle
-from skyquilt.alignment.determined import AGAINST, ELSEWHERE, ELSEWHERE_HIGH, elsewhere_reason
+from skyquilt.alignment.determined import AGAINST, elsewhere_reason, lies_elsewhere
 from skyquilt.alignment.local_adjustment import AdjustedWindow, LocalAdjustment, Window
 from skyquilt.errors import AlignmentError, UnreadablePhotoError
 from skyquilt.live.drone_metadata import Metadata
@@ -140,10 +140,10 @@ class LocalPose:
         if own is None or not 0 < change.observations < AGAINST:
             return ""
         off = (own.map_C - member.prior.map_C)[:2] - np.median(after, axis=0)
-        away, sigma = float(np.linalg.norm(off)), max(usual, float(member.prior.sigma_C[0]))
-        if not away > max(ELSEWHERE * sigma, ELSEWHERE_HIGH * high):  # also without a position
+        away, sigma = np.linalg.norm(off), np.maximum(usual, member.prior.sigma_C[0])
+        if not lies_elsewhere(np.asarray(away), sigma, np.asarray(high)):  # also without a position
             return ""
-        return elsewhere_reason(change.observations, away)
+        return elsewhere_reason(change.observations, float(away))
 
     def _pose_by(
         self,

@@ -39,16 +39,26 @@ class FoundFiles:
     """Name in the survey and file, sorted by name."""
     clips: tuple[tuple[str, Path], ...]
     """The same of video clips."""
-    ignored: tuple[str, ...]
-    """Names of all other files."""
+    others: tuple[tuple[str, Path], ...]
+    """The same of all other files."""
     geo: Path | None
     """A `geo.txt` at the top of the folder."""
     runs: tuple[str, ...]
     """Folders of earlier runs, which are not read."""
     unread: tuple[str, ...] = ()
     """Folders that the system does not let be read, each with the reason."""
-    others: tuple[tuple[str, Path], ...] = ()
-    """Name and path of the files in `ignored`."""
+
+    @property
+    def ignored(self) -> tuple[str, ...]:
+        """Names of all other files."""
+        return tuple(name for name, _ in self.others)
+
+    def lone(self) -> list[tuple[str, Path]]:
+        """The other files that do not have the name of a photo or clip, but for its ending, as
+        cameras and programs write files beside these.
+        """
+        read = {PurePosixPath(n).with_suffix("") for n, _ in (*self.photos, *self.clips)}
+        return [(n, p) for n, p in self.others if PurePosixPath(n).with_suffix("") not in read]
 
 
 def notes_on_files(found: FoundFiles, *, placeless: bool) -> tuple[str, ...]:
@@ -80,22 +90,11 @@ def _closed_note(found: FoundFiles) -> tuple[str, ...]:
     )
 
 
-def _beside(found: FoundFiles) -> set[PurePosixPath]:
-    """Names without endings of photos and clips."""
-    return {PurePosixPath(name).with_suffix("") for name, _ in (*found.photos, *found.clips)}
-
-
 def _unread_notes(found: FoundFiles) -> tuple[str, ...]:
     """A sentence on pictures in formats that are not read, but for those beside a photo of the same
-    name, as cameras write them.
+    name.
     """
-    read = _beside(found)
-    missed = [
-        name
-        for name in found.ignored
-        if PurePosixPath(name).suffix.lower() in _UNREAD
-        and PurePosixPath(name).with_suffix("") not in read
-    ]
+    missed = [n for n, _ in found.lone() if PurePosixPath(n).suffix.lower() in _UNREAD]
     if not missed:
         return ()
     number = f"{len(missed)} pictures are" if len(missed) > 1 else "1 picture is"
@@ -114,13 +113,11 @@ def _misnamed_note(found: FoundFiles) -> tuple[str, ...]:
     """A sentence on photos whose names do not end as those of photos, as of recovered or downloaded
     files; those of a photo's or clip's name (`.jpg_original`, `.THM`) are copies and previews.
     """
-    read = _beside(found)
+    looked_at = found.lone()[:_MOST_LOOKED]
     missed = [
         name
-        for name, path in found.others[:_MOST_LOOKED]
-        if PurePosixPath(name).suffix.lower() not in _UNREAD
-        and PurePosixPath(name).with_suffix("") not in read
-        and begins_as_photo(path)
+        for name, path in looked_at
+        if PurePosixPath(name).suffix.lower() not in _UNREAD and begins_as_photo(path)
     ]
     if not missed:
         return ()

@@ -132,12 +132,7 @@ def _sorted(
         if n not in known and p.name.lower() not in _SIDE_NAMES and p not in beside
     )
     return FoundFiles(
-        photos=tuple(photos),
-        clips=tuple(clips),
-        ignored=tuple(n for n, _ in others),
-        geo=geo,
-        runs=runs,
-        others=tuple(others),
+        photos=tuple(photos), clips=tuple(clips), others=tuple(others), geo=geo, runs=runs
     )
 
 

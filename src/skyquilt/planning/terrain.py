@@ -13,7 +13,7 @@ from skyquilt.errors import SideFileError
 from skyquilt.planning.records import Array
 from skyquilt.raster.drivers import open_raster, why_unreadable
 from skyquilt.raster.map_source import between, plane
-from skyquilt.raster.read_map import MapFile, open_map, read_as
+from skyquilt.raster.read_map import Box, MapFile, open_map, part_between, read_as
 
 MOST_SIDE = 3000
 """Largest number of heights along one side."""
@@ -167,33 +167,24 @@ def _opened(path: Path) -> MapFile:
     return file
 
 
-def _part(
-    file: MapFile, crs: str, around: tuple[float, float, float, float]
-) -> tuple[int, int, int, int] | None:
-    """Row, column, height and width of the part of the file that shows a rectangle (west, south,
-    east, north) of another CRS; None if there is none.
+def _part(file: MapFile, crs: str, around: tuple[float, float, float, float]) -> Box | None:
+    """The part of the file that shows a rectangle (west, south, east, north) of another CRS; None
+    if there is none.
     """
     west, south, east, north = around
     x, y = np.meshgrid(np.linspace(west, east, 5), np.linspace(south, north, 5))
     x, y = between(crs, str(file.crs)).transform(x.ravel(), y.ravel())
-    a, b, c, d, e, f = file.affine
-    px = np.linalg.solve(
-        np.array([[a, b], [d, e]]), np.array([np.subtract(x, c), np.subtract(y, f)])
-    )
+    px = file.pixel(x, y)
     if not np.isfinite(px).all():
         return None
-    size = np.array([file.width, file.height])
+    size = file.width, file.height
     inside = np.clip([px.min(1), px.max(1)], 0, size)
     if (inside[1] - inside[0] <= 0).any():
         return None
-    low = np.clip(np.floor(px.min(1)) - _AROUND, 0, size).astype(int)
-    high = np.clip(np.ceil(px.max(1)) + _AROUND, 0, size).astype(int)
-    return int(low[1]), int(low[0]), int(high[1] - low[1]), int(high[0] - low[0])
+    return part_between(px.min(1) - _AROUND, px.max(1) + _AROUND, size)
 
 
-def _read(
-    file: MapFile, part: tuple[int, int, int, int]
-) -> tuple[NDArray[np.float32], tuple[float, ...]]:
+def _read(file: MapFile, part: Box) -> tuple[NDArray[np.float32], tuple[float, ...]]:
     """Heights in m of a part (NaN where there are none), at most twice as many along a side as a
     terrain has, and the affine that places them.
     """
@@ -206,10 +197,10 @@ def _read(
     heights = values.astype(np.float32) * np.float32(_metres(file))
     # before anything is interpolated, or what is no height would be mixed with what is
     good = valid & (heights >= HEIGHTS[0]) & (heights <= HEIGHTS[1])
-    a, b, c, d, e, f = file.affine
+    a, b, _, d, e, _ = file.affine
     x, y = width / shape[1], height / shape[0]
-    moved = a * column + b * row + c, d * column + e * row + f
-    placed = a * x, b * y, moved[0], d * x, e * y, moved[1]
+    (left,), (top,) = file.ground(np.array([float(column)]), np.array([float(row)]))
+    placed = a * x, b * y, float(left), d * x, e * y, float(top)
     return np.where(good, heights, np.float32("nan")), placed
 
 
@@ -260,13 +251,9 @@ def _grid(
     from rasterio.warp import calculate_default_transform
 
     west, south, east, north = around
-    a, b, c, d, e, f = file.affine
-    column, row = np.array([0, 1, 0, 1]) * file.width, np.array([0, 0, 1, 1]) * file.height
-    x, y = a * column + b * row + c, d * column + e * row + f
     affine, _, _ = calculate_default_transform(
-        plane(str(file.crs)), crs, file.width, file.height,
-        float(x.min()), float(y.min()), float(x.max()), float(y.max()),
-    )  # fmt: skip
+        plane(str(file.crs)), crs, file.width, file.height, *file.bounds()
+    )
     cell = max(abs(affine.a), (east - west) / MOST_SIDE, (north - south) / MOST_SIDE)
     shape = int((north - south) / cell) + 2, int((east - west) / cell) + 2
     return np.full(shape, np.nan, np.float32), west, north, float(cell)

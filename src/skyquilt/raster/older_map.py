@@ -22,7 +22,7 @@ from skyquilt.raster.map_source import (
     plane,
     step_of,
 )
-from skyquilt.raster.read_map import MapFile, open_map, read_as, read_reduced
+from skyquilt.raster.read_map import Box, MapFile, open_map, part_between, read_as, read_reduced
 
 _LOOKED = 512
 """Longer side in px at which the range of colours is looked for."""
@@ -104,16 +104,7 @@ class OlderMap:
 
     def bounds(self) -> Bounds:
         """The least upright rectangle around it."""
-        file = self.file
-        w, h = file.width, file.height
-        x, y = self._ground(np.array([0.0, w, 0, w]), np.array([0.0, 0, h, h]))
-        return float(x.min()), float(y.min()), float(x.max()), float(y.max())
-
-    def _ground(
-        self, column: NDArray[np.float64], row: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        a, b, c, d, e, f = self.file.affine
-        return a * column + b * row + c, d * column + e * row + f
+        return self.file.bounds()
 
     def part(self, bounds: Bounds, gsd: float) -> Part | None:
         """The part with north up and square pixels.
@@ -172,16 +163,12 @@ class OlderMap:
 
     def _window(
         self, pixels_S_part: NDArray[np.float64], w: int, h: int, step: float
-    ) -> tuple[int, int, int, int] | None:
-        """Row, column, height and width in the file that a part of w x h px shows."""
+    ) -> Box | None:
+        """What a part of w x h px shows of the file."""
         ends = pixels_S_part @ np.array([[0, w, 0, w], [0, 0, h, h], [1, 1, 1, 1.0]])
-        size = np.array([self.file.width, self.file.height])
         around = _MARGIN * max(1.0, step / min(self._sides))
-        low = np.clip(np.floor(ends[:2].min(1) - around), 0, size).astype(int)
-        high = np.clip(np.ceil(ends[:2].max(1) + around), 0, size).astype(int)
-        if (high - low < 1).any():
-            return None
-        return int(low[1]), int(low[0]), int(high[1] - low[1]), int(high[0] - low[0])
+        low, high = ends[:2].min(1) - around, ends[:2].max(1) + around
+        return part_between(low, high, (self.file.width, self.file.height))
 
     @cached_property
     def _range(self) -> tuple[float, float]:

@@ -27,6 +27,10 @@ _FINER = 2
 """Pixels per pixel that are read where values cannot be averaged by GDAL."""
 
 
+Box = tuple[int, int, int, int]
+"""Row, column, height and width of a part of a file in px."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MapFile:
     """A raster file and its georeference."""
@@ -61,6 +65,25 @@ class MapFile:
     """Whether the file holds reduced copies of itself."""
     beside: bool = False
     """Whether control points, or a file beside it, place it."""
+
+    def ground(
+        self, column: NDArray[np.float64], row: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """x and y of places in px, counted from the corner."""
+        a, b, c, d, e, f = self.affine
+        return a * column + b * row + c, d * column + e * row + f
+
+    def pixel(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(2, n) column and row, counted from the corner, of places on the ground."""
+        a, b, c, d, e, f = self.affine
+        ground = np.array([np.subtract(x, c), np.subtract(y, f)])
+        return np.asarray(np.linalg.solve(np.array([[a, b], [d, e]]), ground))
+
+    def bounds(self) -> tuple[float, float, float, float]:
+        """West, south, east and north of the least upright rectangle around it."""
+        w, h = self.width, self.height
+        x, y = self.ground(np.array([0.0, w, 0, w]), np.array([0.0, 0, h, h]))
+        return float(x.min()), float(y.min()), float(x.max()), float(y.max())
 
     @property
     def mirrored(self) -> bool:
@@ -173,6 +196,19 @@ def _nodata(raster: "DatasetReader") -> float | None:
     return low if low in FILLS else None
 
 
+def part_between(
+    low: NDArray[np.float64], high: NDArray[np.float64], size: tuple[int, int]
+) -> Box | None:
+    """The part of a file of `size` (width, height) between two places (2,) in px, counted from the
+    corner; None if there is none.
+    """
+    first = np.clip(np.floor(low), 0, size).astype(int)
+    last = np.clip(np.ceil(high), 0, size).astype(int)
+    if (last - first < 1).any():
+        return None
+    return int(first[1]), int(first[0]), int(last[1] - first[1]), int(last[0] - first[0])
+
+
 def read_reduced(source: MapFile, longest: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
     """Pixels (h, w[, 3]) and validity (h, w), averaged so that the longer side has at most
     `longest` px and that pixels are as wide on the ground as they are high.
@@ -183,9 +219,7 @@ def read_reduced(source: MapFile, longest: int) -> tuple[NDArray[Any], NDArray[n
     return read_part(source, (0, 0, source.height, source.width), longest)
 
 
-def read_part(
-    source: MapFile, part: tuple[int, int, int, int], longest: int
-) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+def read_part(source: MapFile, part: Box, longest: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
     """The same of a part (row, column, height, width) that lies inside the raster."""
     _, _, height, width = part
     aspect = source.aspect if abs(np.log(source.aspect)) > 0.01 else 1.0
@@ -207,7 +241,7 @@ def read_window(
 
 
 def read_as(
-    source: MapFile, part: tuple[int, int, int, int], shape: tuple[int, int]
+    source: MapFile, part: Box, shape: tuple[int, int]
 ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
     """A part (row, column, height, width) averaged to another shape (height, width).
 
