@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from skyquilt.alignment.aligners import (
     share_shown,
@@ -14,9 +16,10 @@ from skyquilt.alignment.aligners import (
 from skyquilt.alignment.determined import deviation_px, weak_photos
 from skyquilt.alignment.dominant_plane import dominant_normal, levelled
 from skyquilt.alignment.inputs import AlignmentInputs
-from skyquilt.alignment.oblique import reported_oblique, resected, tilt_deg
+from skyquilt.alignment.oblique import looked_at, reported_oblique, resected, tilt_deg
 from skyquilt.geometry.camera import project, rays
 from skyquilt.geometry.frames import cam_R_map_from_angles, rotation_from_vector
+from skyquilt.matching.candidates import Nearest
 from skyquilt.model.camera import Camera
 from skyquilt.model.features import Features
 from skyquilt.model.poses import Alignment, MapFrame, Pose, TiePoints
@@ -254,3 +257,62 @@ def test_a_black_or_white_photo_is_not_placed_by_its_metadata(level, placed):
     found = with_loose_photos(done, inputs)
     assert (9 in found.poses) == placed
     assert placed or "black or white" in found.rejected[9]
+
+
+# places by which oblique photos are paired
+
+
+def rig(at, height=60.0, tilt=45.0):
+    """Priors of five cameras on a drone at places (x, y): down, and aslant to four sides."""
+    return [
+        replace(prior((x, y, height)), pitch_deg=pitch, yaw_deg=float(yaw))
+        for x, y in at
+        for yaw, pitch in [(0, 0.0), *((side, tilt) for side in (0, 90, 180, 270))]
+    ]
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.floats(36, 59), st.floats(-180, 180), st.floats(20, 300), st.floats(-50, 500))
+def test_where_an_oblique_photo_looks_is_where_its_axis_meets_the_ground(tilt, yaw, height, ground):
+    told = replace(prior((7.0, -3.0, ground + height)), pitch_deg=tilt, yaw_deg=yaw)
+    places = looked_at([told, prior((0, 0, ground + height))], ground)
+    ray = cam_R_map_from_angles(yaw, tilt)[2]
+    meets = told.map_C - ray * height / ray[2]
+    assert np.allclose(meets, [*places[0, :2], ground], atol=1e-6 * height)
+    assert np.linalg.norm(places[0, 2:]) == pytest.approx(height * np.sin(np.radians(tilt)))
+    assert np.allclose(places[1], 0, atol=1e-9)  # looks straight down
+
+
+def test_photos_that_tell_no_view_count_by_their_position():
+    level = [prior((x, 0.0, 60.0)) for x in (0, 10)]
+    slanting = replace(level[0], pitch_deg=50.0)
+    unknown = replace(slanting, yaw_deg=np.nan)
+    assert looked_at(level, 0.0) is None
+    assert looked_at([*level, slanting], np.nan) is None  # nothing tells how far it looks
+    assert looked_at([*level, slanting, unknown], 0.0)[3].tolist() == [0, 0, 0, 0]
+    below = replace(slanting, map_C=np.array([0.0, 0, -20]))  # counts as high as the others
+    horizon = replace(slanting, pitch_deg=89.0)
+    places = looked_at([*level, slanting, below, horizon], 0.0)
+    assert places[3].tolist() == places[2].tolist()
+    assert 60 * 1.7 < np.linalg.norm(places[4, :2]) < 60 * 2.01
+
+
+def test_photos_of_five_cameras_are_paired_with_those_that_look_alike():
+    """By positions, four of each photo's nearest ones were of its own place, and show the ground
+    from other sides: a drone with five cameras was mapped in parts.
+    """
+    at = [(18.0 * x, 24.0 * y) for y in range(4) for x in range(5)]
+    priors = rig(at)
+    side = [k % 5 for k in range(len(priors))]
+    near = {
+        (i, j)
+        for i in range(len(priors))
+        for j in range(i + 1, len(priors))
+        if side[i] == side[j] and np.hypot(*np.subtract(at[i // 5], at[j // 5])) < 31
+    }
+
+    def missed(places):
+        return len(near - set(Nearest()(places))) / len(near)
+
+    assert missed(looked_at(priors, 0.0)) == 0
+    assert missed(np.array([p.map_C[:2] for p in priors])) > 0.4

@@ -29,6 +29,10 @@ MOST_OBLIQUE = 0.4
 """With a larger share of oblique photos than this the survey itself is oblique, and they are not
 told apart.
 """
+LEAST_FALL = np.cos(np.radians(60.0))
+"""Flatter views count as if they fell as steeply as this: what they show best lies nearer than the
+place in their middle.
+"""
 SAME_PX = 3.0
 """Distance in px of the image searched for features up to which a keypoint is that of a tie
 point.
@@ -54,6 +58,31 @@ def tilted(prior: Prior) -> bool:
     """Whether a photo's metadata report a large tilt."""
     R = cam_R_map_from_angles(0.0, prior.pitch_deg, prior.roll_deg)
     return prior.sigma_tilt_deg <= STATED_DEG and tilt_deg(R) > OBLIQUE_DEG
+
+
+def looked_at(priors: Sequence[Prior], ground_m: float) -> Array | None:
+    """Places (n, 4) by which photos that may show the same are near to one another, where some
+    report that they are oblique; None where none does. In m: where each looks at level ground of
+    the height `ground_m` (its position, NaN where unknown, if it does not tell its view), and the
+    horizontal part of its direction, as long for a level view as photos usually lie above ground.
+
+    Photos of five cameras on one drone are near to one another by their positions, but have nothing
+    in common; those that look at one place from one side match.
+    """
+    C = np.array([p.map_C for p in priors]).reshape(-1, 3)
+    above = C[:, 2] - ground_m
+    if not any(map(tilted, priors)) or not (above > 0).any():
+        return None
+    usual = float(np.median(above[above > 0]))
+    places = np.zeros((len(priors), 4))
+    places[:, :2] = C[:, :2]
+    for i, prior in enumerate(priors):
+        if np.isfinite(prior.yaw_deg) and prior.sigma_tilt_deg <= STATED_DEG:
+            R = cam_R_map_from_angles(prior.yaw_deg, prior.pitch_deg, prior.roll_deg)
+            away = R[2, :2] / max(-R[2, 2], LEAST_FALL)
+            places[i, :2] += away * (above[i] if above[i] > 0 else usual)
+            places[i, 2:] = R[2, :2] * usual
+    return places
 
 
 def tilts_reported(priors: Sequence[Prior]) -> bool:

@@ -29,7 +29,9 @@ class Nearest:
     version: ClassVar[int] = 1
 
     def __call__(self, map_xy: NDArray[Any], reach_m: float | None = None) -> list[Pair]:
-        """Pairs i < j of photos with positions (n, 2) in m (NaN where unknown), nearest first."""
+        """Pairs i < j of photos with positions (n, 2) in m (NaN where unknown), nearest first; or
+        with places (n, 4) that tell oblique views, too (`alignment.oblique.looked_at`).
+        """
         known = np.flatnonzero(np.isfinite(map_xy).all(1))
         if len(known) < 2:
             return []

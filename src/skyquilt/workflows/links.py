@@ -1,6 +1,6 @@
 """Finds photos that show the same ground: candidate pairs, matches, verified links."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby, pairwise
 from typing import Any
@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.oblique import looked_at
 from skyquilt.alignment.pose import ByPose
+from skyquilt.alignment.start import ground_of
 from skyquilt.engine.clock import Steps
 from skyquilt.engine.free_memory import give_back_growth
 from skyquilt.engine.store import Store, digest
@@ -200,7 +202,7 @@ class _Linker:
         methods: Methods,
         store: Store,
     ) -> None:
-        self.found, self.methods, self.store = found, methods, store
+        self.found, self.frame, self.methods, self.store = found, frame, methods, store
         self.features = found.features
         self.marks = marks_of(found.photos, found.features)
         self.expected: ExpectedPlaces | None = None
@@ -238,6 +240,9 @@ class _Linker:
         photos = [(seen_as(p), p.width, p.height) for p in self.found.photos]
         methods = self.methods.nearest, self.methods.retrieval, link_photos
         places = [p.map_C[:2].tolist() for p in priors]
+        views = looked_at(priors, ground_of(self.frame))
+        if views is not None:
+            places = views.tolist()
         return digest(photos, places, self._recipe, *methods)
 
 
@@ -337,14 +342,15 @@ def _linked(
     n = len(found.photos)
     xy = np.array([p.map_C[:2] for p in priors]).reshape(-1, 2)
     lost = [i for i in range(n) if not np.isfinite(xy[i]).all()]
+    nearest = _near(methods, xy, looked_at(priors, ground_of(linker.frame)))
     # in order of capture, so that the features of a photo are read once for all its pairs
-    first = sorted({*sequence(n), *_closest(methods.nearest(xy), n, 2)})
+    first = sorted({*sequence(n), *_closest(nearest(None), n, 2)})
     tried: list[Link | RejectedLink] = []
     for batch in workers.each(matched, _batches(first)):
         tried += batch
         yield len(tried), 2 * len(first)
     reach = overlap_reach_m([k for k in tried if isinstance(k, Link)], found, xy)
-    rest = methods.nearest(xy, reach) if n > 2 else []
+    rest = nearest(reach) if n > 2 else []
     if lost and n > 2:
         rest += methods.retrieval(found.features, None if len(lost) == n else lost)
     done = set(first)
@@ -353,6 +359,20 @@ def _linked(
         tried += batch
         yield len(tried), len(first) + len(rest)
     return tried
+
+
+def _near(
+    methods: Methods, xy: NDArray[np.float64], views: NDArray[np.float64] | None
+) -> Callable[[float | None], list[Pair]]:
+    """Pairs, nearest first, of photos that lie within a reach in m (None: any) by their positions
+    (n, 2), or by what oblique ones look at (n, 4).
+    """
+
+    def nearest(reach_m: float | None) -> list[Pair]:
+        pairs = methods.nearest(xy, reach_m)
+        return pairs if views is None else [*methods.nearest(views, reach_m), *pairs]
+
+    return nearest
 
 
 def _closest(pairs: Sequence[Pair], count: int, each: int) -> list[Pair]:
