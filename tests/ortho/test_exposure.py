@@ -150,6 +150,26 @@ def test_values_in_proportion_to_the_light_are_told_from_curved_ones(lit):
     assert grown.white == found.white and complete(grown, views).white == found.white
 
 
+def test_white_balance_of_a_linear_sensor_is_found_where_photos_are_equally_bright(lit):
+    """Factors on the bands whose mean changes nothing: the grey values of photos tell nothing of
+    the response, their colours do. What was multiplied in comes out of all values alike.
+    """
+    views = lit[0]
+    tints = np.random.default_rng(3).uniform(-0.3, 0.3, (len(views), 2))
+    true = {v.photo: 1 + np.array([a, b, -a - b]) for v, (a, b) in zip(views, tints, strict=True)}
+    pictures = {
+        v.photo: np.rint(np.clip(photograph(v), 12, 150)[..., None] * true[v.photo]).astype(np.uint8)
+        for v in views
+    }
+    found = Balance()(views, pictures, FLAT, GRID.bounds)
+    assert found.white == WHITES[-1]
+    levels = np.array([20.0, 60.0, 120.0])[:, None]
+    even = np.stack(
+        [found.brightened(levels * true[v.photo], np.exp(found.gains[v.photo])) for v in views]
+    )
+    assert (even.std(0) < 0.02 * levels).all()
+
+
 def test_the_map_loses_its_patches(lit):
     views, pictures, _ = lit
     whole = Window(row=0, column=0, height=GRID.height, width=GRID.width)

@@ -166,7 +166,7 @@ class Balance:
     """Least share of the differences between photos that fields must explain to be applied."""
     whites: tuple[float, ...] = WHITES
     """Values at which the cameras' response may end; the survey's overlaps decide."""
-    version: ClassVar[int] = 8
+    version: ClassVar[int] = 9
 
     def under(self, white: float) -> "Balance":
         """The same for a response that is known."""
@@ -408,12 +408,18 @@ class Samples:
         return out
 
     def apart(self, exposure: Exposure, views: Sequence[View]) -> float:
-        """Median difference from the mean of their point, in grey values, of corrected samples."""
+        """Median difference from the mean of their point, in levels, of corrected samples: the mean
+        of all bands, since white balance changes bands of a photo apart.
+        """
         photos = [v.photo for v in views]
-        gains = np.array([exposure.gains[i].mean() for i in photos], np.float32)
+        gains = np.stack([exposure.gains[i] for i in photos])
         fields = np.stack([exposure.fields[i] for i in photos])
-        odds = np.exp(gains[self.row] + self.field(fields))
-        return _off_means(exposure.brightened(self.value.mean(1), odds), self.point)
+        field = self.field(fields)
+        bands = [
+            exposure.brightened(value, np.exp(gains[self.row, k] + field))
+            for k, value in enumerate(self.value.T)
+        ]
+        return float(np.mean([_off_means(levels, self.point) for levels in bands]))
 
 
 def _around(view: View, x: NDArray[Any], y: NDArray[Any]) -> tuple[slice, slice]:
