@@ -40,6 +40,17 @@ def test_gains_that_even_the_photos_leave_nothing():
     assert found(plain(100, 110), wrong)["median"] > 9
 
 
+def test_white_balance_that_is_evened_leaves_nothing():
+    """A red and a blue picture of one grey ground: each band has its own odds."""
+    colours = np.array([[140, 100, 70], [70, 100, 140]])
+    pictures = {i: np.broadcast_to(c, (60, 80, 3)).astype(np.uint8) for i, c in enumerate(colours)}
+    odds = colours / (255 - colours)
+    gains = dict(enumerate(np.log(100 / 155 / odds).astype(np.float32)))
+    even = Exposure(gains=gains, fields={i: np.zeros(6, np.float32) for i in range(2)})
+    assert found(pictures, even)["p95"] < 0.01
+    assert found(pictures)["median"] > 5
+
+
 def test_clipped_values_do_not_count():
     assert found(plain(100, 255)) is None
     assert found(plain(2, 100)) is None

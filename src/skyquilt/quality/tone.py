@@ -15,6 +15,8 @@ POINTS = 4000
 """Number of cells of ground that are compared."""
 SIDE = 5
 """Side in thumbnail px of the window whose mean is a photo's value of a cell."""
+LUMA = np.array([0.299, 0.587, 0.114])
+"""Weights of red, green and blue in a grey value (ITU-R BT.601)."""
 CLIPPED = (6.0, 249.0)
 """Grey values beyond these are clipped and do not count."""
 
@@ -63,18 +65,24 @@ def _values(
     thumbnail: NDArray[Any], view: View, u: NDArray[Any], v: NDArray[Any], exposure: Exposure
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Balanced values (n,) of a photo at pixels, means over windows, and which of them count."""
-    grey = thumbnail if thumbnail.ndim == 2 else thumbnail.reshape(*thumbnail.shape[:2], -1)
-    if grey.ndim == 3:
-        grey = cv2.cvtColor(grey, cv2.COLOR_RGB2GRAY) if grey.shape[2] == 3 else grey[..., 0]
-    smooth = cv2.blur(grey.astype(np.float32), (SIDE, SIDE))
-    h, w = smooth.shape
+    bands = thumbnail.reshape(*thumbnail.shape[:2], -1)
+    bands = bands if bands.shape[2] == 3 else bands[..., :1]
+    smooth = cv2.blur(bands.astype(np.float32), (SIDE, SIDE)).reshape(bands.shape)
+    h, w = smooth.shape[:2]
     column = np.clip(np.rint((u + 0.5) * w / view.camera.width - 0.5), 0, w - 1).astype(int)
     row = np.clip(np.rint((v + 0.5) * h / view.camera.height - 0.5), 0, h - 1).astype(int)
-    value = smooth[row, column].astype(np.float64)
+    shown = smooth[row, column].astype(np.float64)
+    value = _grey(shown)
     if thumbnail.dtype.kind == "f":
         return value + exposure.offsets.get(view.photo, 0.0), np.isfinite(value)
     known = (value > CLIPPED[0] * exposure.level) & (value < CLIPPED[1] * exposure.level)
     if view.photo in exposure.gains:
-        odds = exposure.odds(view.photo, *image_place(view, u[None], v[None]))[0].mean(-1)
-        value = exposure.brightened(value, odds)
+        odds = exposure.odds(view.photo, *image_place(view, u[None], v[None]))[0]
+        odds = odds if odds.shape == shown.shape else odds.mean(-1, keepdims=True)
+        value = _grey(exposure.brightened(shown, odds))
     return value / exposure.level, known
+
+
+def _grey(bands: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Grey values (n,) of colours (n, 3), or of one band (n, 1)."""
+    return np.asarray(bands @ LUMA if bands.shape[1] == 3 else bands[:, 0])
