@@ -167,6 +167,8 @@ def find_ground(
 
         surface = yield from apart(told, CountedParts())
         views = tuple(make_views(alignment, surface, limits))
+        grid = grid_of(views, gsd, bounds)  # lower ground at a rim reaches further
+        grid = grid if grows is None else grows.grown(grid)
     yield 1, 1
     return Ground(
         surface=surface,

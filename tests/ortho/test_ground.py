@@ -1,0 +1,74 @@
+"""The map's grid covers what the photos show on the heights that were found last."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from skyquilt.engine.clock import result_of
+from skyquilt.engine.store import Store
+from skyquilt.geometry.frames import cam_R_map_from_angles
+from skyquilt.model.poses import Alignment, MapFrame, Pose, no_ties
+from skyquilt.ortho.ground import find_ground
+from skyquilt.ortho.tie_surface import FromTiePoints, level
+from skyquilt.settings import PictureSettings
+from skyquilt.workflows.artefacts import REGISTRY
+from tests.ortho.scenes import CAMERA
+
+HEIGHT_M = 40.0
+XYZ = np.array([[x, y, 0.0] for x in (-20.0, 0.0, 20.0) for y in (-15.0, 15.0)])
+
+
+@dataclass(frozen=True)
+class Found:
+    """Pictures by which all ground lies at one height in m."""
+
+    z: float
+
+    def __call__(self, surface, views, grid, grey, keep):
+        return level(self.z)
+
+
+@pytest.fixture
+def alignment():
+    """Two vertical photos, 20 m apart, whose tie points lie at height 0."""
+    poses = {
+        k: Pose(cam_R_map=cam_R_map_from_angles(0, 0, 0), map_C=np.array([x, 0.0, HEIGHT_M]))
+        for k, x in enumerate((-10.0, 10.0))
+    }
+    return Alignment(
+        method="bundle",
+        why="",
+        frame=MapFrame(crs=None, origin=(0.0, 0.0), vertical_datum="unknown"),
+        poses=poses,
+        cameras={"one": CAMERA},
+        camera_of=dict.fromkeys(poses, "one"),
+        blocks=((0, 1),),
+        ties=replace(no_ties(), xyz=XYZ),
+    )
+
+
+@pytest.mark.parametrize("low_m", [-20.0, 0.0, 8.0])
+def test_the_grid_covers_all_that_photos_show_on_the_heights_found(alignment, low_m, tmp_path):
+    """The size of the ground that a vertical photo shows is its height above it, times the size of
+    the picture over the focal length.
+    """
+    store = Store(folder=tmp_path, registry=REGISTRY)
+    steps = find_ground(
+        alignment,
+        lambda photo, side: np.full((30, 40), 100, np.uint8),
+        FromTiePoints(),
+        Found(low_m),
+        PictureSettings(),
+        store,
+    )
+    ground = result_of(steps)
+    west, south, east, north = ground.grid.bounds
+    lens = replace(CAMERA, k1=0, k2=0, p1=0, p2=0)
+    size = (HEIGHT_M - low_m) / lens.focal
+    assert east - west == pytest.approx(20 + lens.width * size, rel=0.04)  # the lens widens it
+    assert north - south == pytest.approx(lens.height * size, rel=0.04)
+    shown = np.concatenate([v.footprint for v in ground.views])
+    margin = ground.grid.gsd
+    assert (shown.min(0) > [west - margin, south - margin]).all()
+    assert (shown.max(0) < [east + margin, north + margin]).all()
