@@ -157,10 +157,10 @@ def test_white_balance_of_a_linear_sensor_is_found_where_photos_are_equally_brig
     views = lit[0]
     tints = np.random.default_rng(3).uniform(-0.3, 0.3, (len(views), 2))
     true = {v.photo: 1 + np.array([a, b, -a - b]) for v, (a, b) in zip(views, tints, strict=True)}
-    pictures = {
-        v.photo: np.rint(np.clip(photograph(v), 12, 150)[..., None] * true[v.photo]).astype(np.uint8)
-        for v in views
-    }
+    pictures = {}
+    for v in views:
+        grey = np.clip(photograph(v), 12, 150)
+        pictures[v.photo] = np.rint(grey[..., None] * true[v.photo]).astype(np.uint8)
     found = Balance()(views, pictures, FLAT, GRID.bounds)
     assert found.white == WHITES[-1]
     levels = np.array([20.0, 60.0, 120.0])[:, None]
