@@ -67,8 +67,8 @@ def _values(
     """Balanced values (n,) of a photo at pixels, means over windows, and which of them count."""
     bands = thumbnail.reshape(*thumbnail.shape[:2], -1)
     bands = bands if bands.shape[2] == 3 else bands[..., :1]
-    smooth = cv2.blur(bands.astype(np.float32), (SIDE, SIDE)).reshape(bands.shape)
-    h, w = smooth.shape[:2]
+    smooth = np.asarray(cv2.blur(bands.astype(np.float32), (SIDE, SIDE))).reshape(bands.shape)
+    h, w = thumbnail.shape[:2]
     column = np.clip(np.rint((u + 0.5) * w / view.camera.width - 0.5), 0, w - 1).astype(int)
     row = np.clip(np.rint((v + 0.5) * h / view.camera.height - 0.5), 0, h - 1).astype(int)
     shown = smooth[row, column].astype(np.float64)
