@@ -108,8 +108,8 @@ def test_photos_that_overlap_much_are_sampled_less_and_gains_are_found_again(lit
     many = [replace(v, photo=1000 * k + v.photo) for k in range(12) for v in views]
     shown = {v.photo: pictures[v.photo % 1000] for v in many}
     balance = Balance(points=1)
-    few = balance._samples(views, pictures, FLAT, GRID.bounds)
-    more = balance._samples(many, shown, FLAT, GRID.bounds)
+    few = balance.samples(views, pictures, FLAT, GRID.bounds)
+    more = balance.samples(many, shown, FLAT, GRID.bounds)
     assert 1 > few.prior == pytest.approx(12 * more.prior)
     assert np.bincount(more.row).mean() < 1.2 * SAMPLES
     assert np.bincount(more.row).mean() == pytest.approx(SAMPLES, rel=0.4)
@@ -269,7 +269,7 @@ def test_an_area_that_some_photos_do_not_show(lit):
         v for v in views if (v.footprint.min(0) - 0.2 * np.ptp(v.footprint, 0).max() > (x, y)).any()
     ]
     assert far
-    samples = Balance()._samples(views, pictures, FLAT, (x, y, x + 0.1, y + 0.1))
+    samples = Balance().samples(views, pictures, FLAT, (x, y, x + 0.1, y + 0.1))
     assert not set(samples.row) & {views.index(v) for v in far}
 
 
@@ -365,7 +365,7 @@ def test_close_weights_are_not_taken_where_light_differs_over_each_photo(lit):
         grey = np.clip(pictures[v.photo].astype(float), 12, 240)
         uneven[v.photo] = np.rint(odds_scaled(grey, field)).astype(np.uint8)
     balance = Balance().under(WHITES[0])
-    samples = balance._samples(views, uneven, FLAT, GRID.bounds)
+    samples = balance.samples(views, uneven, FLAT, GRID.bounds)
     where = np.array([v.footprint.mean(0) for v in views])
     pairs = differences.Pairs.of(samples.row, samples.point, where)
     wide, _ = balance._best(samples, views, pairs, MADE_NOW, closely=False)

@@ -10,12 +10,15 @@ import rasterio
 from PIL import Image
 
 from skyquilt.imaging.blank import around, joined
+from skyquilt.imaging.views import make_views
 from skyquilt.ortho.spoilt import spoilt_parts
+from skyquilt.ortho.tie_surface import level
 from skyquilt.settings import MosaicSettings
 from skyquilt.simulate import preset, simulate
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Route
 from skyquilt.workflows.mosaic import mosaic
+from tests.ortho.scenes import GROUND, photograph
 from tests.ortho.test_sharpness import flight, seen
 
 
@@ -105,3 +108,42 @@ def test_the_map_of_a_bracket_is_not_white_where_the_ground_is_not(tmp_path):
     whole = inside[:h, :w].reshape(h // 8, 8, w // 8, 8).all((1, 3))
     # a band that is clipped has no noise: 0.003 of the squares without the mend
     assert (squares[whole] < 0.7).mean() < 0.001
+
+
+def pictures(alignment, ground=GROUND):
+    """What each photo of a flight shows of a ground, (300, 400, 3)."""
+    views = make_views(alignment, level(0.0))
+    grey = {v.photo: photograph(v, ground) for v in views}
+    return {i: np.rint(np.dstack([g] * 3)).astype(np.uint8) for i, g in grey.items()}
+
+
+def test_dust_yields_where_all_photos_show_it():
+    """Two discs of 30 and 22 px (of 400 x 300), 30 and 20 % darker, in all photos but at no place
+    of the ground: they are found, and little else of the picture.
+    """
+    alignment = flight(12, apart=6.0)
+    clean = pictures(alignment)
+    v, u = np.mgrid[:300, :400]
+    away = [
+        (np.hypot(u - x, v - y), r, k) for x, y, r, k in ((130, 90, 15, 0.3), (290, 200, 11, 0.2))
+    ]
+    dust = np.prod([1 - k * np.clip(1.5 - d / r, 0, 1) for d, r, k in away], axis=0)
+    spotted = {i: np.rint(p * dust[..., None]).astype(np.uint8) for i, p in clean.items()}
+    marks, notes = shown(alignment, spotted)
+    assert sorted(marks) == list(range(12))
+    yields = marks[0].at(u, v) < 0
+    for d, r, _ in away:
+        assert yields[d < r].all()
+    assert not yields[np.min([d - 3 * r for d, r, _ in away], axis=0) > 20].any()
+    assert len(notes) == 1 and "darkened at the same place of every picture" in notes[0]
+    assert shown(alignment, clean) == ({}, ())
+
+
+def test_a_road_in_the_middle_of_every_picture_is_no_dust():
+    """One line flown along a dark road: each photo has it at the same place, as has the ground."""
+    ground = GROUND.copy()
+    ground[1540:1660] *= 0.6  # 3 m wide, along the line
+    along = pictures(flight(10, apart=4.0), ground)
+    middle = np.mean([p[140:160, 50:350].mean() / p.mean() for p in along.values()])
+    assert middle < 0.8  # it is there
+    assert shown(flight(10, apart=4.0), along) == ({}, ())

@@ -184,7 +184,7 @@ class Balance:
         usable = [v for v in views if v.photo in thumbnails]
         if len(usable) < 2:
             return NEUTRAL
-        samples = self._samples(usable, thumbnails, surface, bounds, keep)
+        samples = self.samples(usable, thumbnails, surface, bounds, keep)
         if not len(samples.point):
             return NEUTRAL
         where = np.array([v.footprint.mean(0) for v in usable])
@@ -316,7 +316,7 @@ class Balance:
         fields[:, 5] = mine[:, 1]
         return fields
 
-    def _samples(
+    def samples(
         self,
         views: Sequence[View],
         thumbnails: Mapping[int, NDArray[np.uint8]],
@@ -324,6 +324,9 @@ class Balance:
         bounds: tuple[float, float, float, float],
         keep: Keep = MADE_NOW,
     ) -> "Samples":
+        """Brightness of ground points, about `points` of them, in photos that show them; bounds in
+        m.
+        """
         west, south, east, north = bounds
         area, each = (east - west) * (north - south), POINTS * len(views)
         seen_by = sum(cv2.contourArea(v.footprint.astype(np.float32)) for v in views) / area

@@ -136,7 +136,7 @@ class Levelling:
         if self.dtype == "uint16":
             level = _level([small[v.photo] for v in views])
             small = _Levels(small, level)
-        small = _Grey(small) if self.mixed else small
+        small = InGrey(small) if self.mixed else small
         return replace(self.balance(views, small, surface, bounds, self.keep), level=level)
 
 
@@ -165,7 +165,7 @@ class _Pictures(Mapping[int, NDArray[Any]]):
         return iter(self._pictures)
 
 
-class _Grey(_Pictures):
+class InGrey(_Pictures):
     """Pictures in three equal bands."""
 
     def __getitem__(self, photo: int) -> NDArray[Any]:

@@ -1,22 +1,51 @@
-"""What photos show badly, so that others are drawn in their place: marks, blur, and what is
+"""What photos show badly, so that others are drawn in their place: marks, blur, spots, and what is
 overexposed.
+
+Dust on a lens or a sensor darkens the same place of every picture. What a photo shows there is
+darker than what others show of the same ground, and than what lies beside it in the picture.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.imaging.blank import Blank, around, joined
+from skyquilt.imaging.views import make_views
 from skyquilt.model.poses import Alignment
-from skyquilt.ortho.sharpness import find_blurred
+from skyquilt.ortho.exposure import Balance, Samples
+from skyquilt.ortho.radiometry import InGrey
+from skyquilt.ortho.sharpness import FEWEST_SPOILT, LARGEST_SPOT, find_blurred
+from skyquilt.ortho.tie_surface import level
 from skyquilt.photos.side_rows import sentence_of
 
 WHITE = 250
 """Level of 255 from which a band of a reduced picture shows nothing more."""
 LEAST_WHITE = 0.02
 """Share of a picture that is that white where it counts as overexposed: roofs and cars are less."""
+
+SPOT_POINTS, SPOT_CELLS = 12_000, 48
+"""Ground points that are compared, and cells of a picture along its longer side: so many points
+give each cell some 20 values, whatever the number of photos.
+"""
+DARKER, SURELY = 0.06, 6.0
+"""A cell is darkened by a spot where its median lies so far, in log odds, and by so many of its
+standard deviations below those around: dust takes 0.2 to 0.5.
+"""
+WITHIN, FEWEST_VALUES = 9, 8
+"""Cells along a side of these, and fewest values of a cell."""
+RINGS = 12
+"""Rings of a picture whose medians are taken away first: corners are dark for another reason."""
+FINER = 4
+"""Cells of the raster that says where spots are, for each cell, along a side."""
+SIGMA_OF_QUARTILES = 0.93
+"""Standard deviation of a median of normal values, over the distance of their quartiles, times the
+root of their number.
+"""
+ROUNDS = 3
+"""Rounds in which photos' and points' brightness are told apart."""
 
 
 def spoilt_parts(
@@ -38,8 +67,10 @@ def spoilt_parts(
             white[i] = part
     if white:
         notes += (overexposed_note([names[i] for i in white]),)
+    spots, told = find_spots(alignment, thumbnails)
+    notes += told
     out = dict(fixed)
-    for found in (blurred, white):
+    for found in (blurred, white, spots):
         out |= {i: joined(out[i], b) if i in out else b for i, b in found.items()}
     return out, notes
 
@@ -64,3 +95,104 @@ def overexposed(thumbnail: NDArray[Any], size: tuple[int, int]) -> Blank | None:
     if white.mean() <= LEAST_WHITE:
         return None
     return around(white, size)
+
+
+def find_spots(
+    alignment: Alignment, thumbnails: Mapping[int, NDArray[Any]]
+) -> tuple[dict[int, Blank], tuple[str, ...]]:
+    """Dark spots at the same place of all pictures of a camera, by photo (index), and notes.
+    `thumbnails`: (h, w[, bands]) of the photos; only those of 8 bits are judged.
+    """
+    photos = [i for i in sorted(alignment.poses) if thumbnails[i].dtype == np.uint8]
+    if len(photos) < FEWEST_SPOILT:
+        return {}, ()
+    xyz = alignment.ties.xyz
+    flat = level(float(np.median(xyz[:, 2])) if len(xyz) else 0.0)
+    views = [v for v in make_views(alignment, flat) if v.photo in set(photos)]
+    if not views:
+        return {}, ()
+    outline = np.concatenate([v.footprint for v in views])
+    (west, south), (east, north) = outline.min(0), outline.max(0)
+    samples = Balance(points=SPOT_POINTS).samples(
+        views, InGrey(thumbnails), flat, (west, south, east, north)
+    )
+    darker = _darker(samples, len(views))
+    cameras = np.array([alignment.camera_of[v.photo] for v in views])
+    found, notes = dict[int, Blank](), list[str]()
+    for name in dict.fromkeys(cameras.tolist()):
+        own = cameras == name
+        if own.sum() < FEWEST_SPOILT:
+            continue
+        size = alignment.cameras[name].width, alignment.cameras[name].height
+        here = own[samples.row] & np.isfinite(darker)
+        spot = _spots(samples.place[here], darker[here], size)
+        if spot.any():
+            mark = around(np.kron(spot, np.ones((FINER, FINER))) > 0, size)
+            found |= {v.photo: mark for v, mine in zip(views, own, strict=True) if mine}
+            notes.append(
+                f"Photos of {name} are darkened at the same place of every picture, on"
+                f" {100 * spot.mean():.1f} % of it: dust on the lens or the sensor, or the drone's"
+                " own shadow. It is drawn only where no other photo shows the ground."
+            )
+    return found, tuple(notes)
+
+
+def _darker(samples: Samples, number: int) -> NDArray[np.float64]:
+    """(N,) how much lighter each sample is than others of the same ground, in log odds, once each
+    of a `number` of photos has one brightness; NaN where fewer than two others show it.
+    """
+    log = samples.log.mean(1).astype(np.float64)
+    shown = np.bincount(samples.point)[samples.point]
+    several = shown > 2
+    gain = np.zeros(number)
+    for _ in range(ROUNDS):
+        middle = _quartiles(
+            samples.row[several], _off(samples, log - gain[samples.row])[several], number
+        )[1]
+        gain += np.nan_to_num(middle)
+    off = _off(samples, log - gain[samples.row]) * shown / np.maximum(shown - 1, 1)
+    return np.where(several, off, np.nan)
+
+
+def _off(samples: Samples, even: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Differences (N,) of values from the mean of their point."""
+    mean = np.bincount(samples.point, even) / np.bincount(samples.point)
+    return np.asarray(even - mean[samples.point])
+
+
+def _spots(
+    place: NDArray[Any], off: NDArray[np.float64], size: tuple[int, int]
+) -> NDArray[np.bool_]:
+    """Cells (rows, columns) of a picture of a `size` (width and height in px) that are darkened,
+    from how much lighter than others samples (n,) at places (n, 2) in it are, see `image_place`.
+    """
+    ring = np.minimum((place**2).sum(1) * RINGS, RINGS - 1).astype(int)
+    off = off - _quartiles(ring, off, RINGS)[1, ring]
+    cell = max(size) / SPOT_CELLS
+    shape = tuple(max(1, round(n / cell)) for n in size[::-1])
+    share = place[:, ::-1] * np.hypot(*size) / 2 / np.array(size[::-1]) + 0.5
+    row, column = np.clip((share * shape).astype(int), 0, np.array(shape) - 1).T
+    at = row * shape[1] + column
+    count = np.bincount(at, minlength=shape[0] * shape[1]).reshape(shape)
+    low, middle, high = _quartiles(at, off, count.size).reshape(3, *shape)
+    sigma = SIGMA_OF_QUARTILES * (high - low) / np.sqrt(np.maximum(count, 1))
+    pad = np.pad(middle, WITHIN // 2, mode="reflect")
+    near = np.lib.stride_tricks.sliding_window_view(pad, (WITHIN, WITHIN))
+    beside = np.nanmedian(near.reshape(*shape, -1), 2)
+    with np.errstate(invalid="ignore"):
+        dark = middle - beside < -np.maximum(DARKER, SURELY * sigma)
+    dark &= count >= FEWEST_VALUES
+    square = np.ones((3, 3), np.uint8)  # one cell alone may be chance
+    together = cv2.filter2D(dark.view(np.uint8), -1, square, borderType=cv2.BORDER_CONSTANT)
+    spot = cv2.dilate((dark & (together > 1)).view(np.uint8), square) > 0
+    return spot if spot.mean() <= LARGEST_SPOT else np.zeros_like(spot)
+
+
+def _quartiles(group: NDArray[Any], value: NDArray[np.float64], number: int) -> NDArray[np.float64]:
+    """Quartiles (3, number) of the values (n,) of each group, about; NaN where it has none."""
+    order = np.lexsort((value, group))
+    count = np.bincount(group, minlength=number)
+    first = np.cumsum(count) - count
+    at = np.array([[count // 4], [count // 2], [3 * count // 4]])[:, 0] + first
+    found = value[order][np.minimum(at, len(value) - 1)]
+    return np.where(count > 0, found, np.nan)
