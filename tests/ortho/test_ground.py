@@ -9,7 +9,8 @@ from skyquilt.engine.clock import result_of
 from skyquilt.engine.store import Store
 from skyquilt.geometry.frames import cam_R_map_from_angles
 from skyquilt.model.poses import Alignment, MapFrame, Pose, no_ties
-from skyquilt.ortho.ground import find_ground
+from skyquilt.model.raster import Grid
+from skyquilt.ortho.ground import ALIGNED, find_ground
 from skyquilt.ortho.tie_surface import FromTiePoints, level
 from skyquilt.settings import PictureSettings
 from skyquilt.workflows.artefacts import REGISTRY
@@ -64,11 +65,23 @@ def test_the_grid_covers_all_that_photos_show_on_the_heights_found(alignment, lo
     )
     ground = result_of(steps)
     west, south, east, north = ground.grid.bounds
-    lens = replace(CAMERA, k1=0, k2=0, p1=0, p2=0)
-    size = (HEIGHT_M - low_m) / lens.focal
-    assert east - west == pytest.approx(20 + lens.width * size, rel=0.04)  # the lens widens it
-    assert north - south == pytest.approx(lens.height * size, rel=0.04)
+    spare = 2 * ALIGNED * ground.grid.gsd
+    for length, px, apart in (
+        (east - west, CAMERA.width, 20.0),
+        (north - south, CAMERA.height, 0.0),
+    ):
+        least = apart + px * (HEIGHT_M - low_m) / CAMERA.focal
+        most = apart + px * (HEIGHT_M - min(low_m, 0.0)) / CAMERA.focal  # as tie points tell
+        assert 0.99 * least < length < 1.04 * most + spare  # the lens widens it by up to 4 %
     shown = np.concatenate([v.footprint for v in ground.views])
     margin = ground.grid.gsd
     assert (shown.min(0) > [west - margin, south - margin]).all()
     assert (shown.max(0) < [east + margin, north + margin]).all()
+
+
+def test_a_grid_reaches_as_far_as_another_one_and_its_cells_stay():
+    grid = Grid(west=10.0, north=50.0, gsd=0.5, width=40, height=60)
+    wanted = Grid(west=7.0, north=51.0, gsd=0.25, width=100, height=200)
+    wider = grid.reaching(wanted, 16)
+    assert wider == Grid(west=2.0, north=58.0, gsd=0.5, width=60, height=114)
+    assert grid.reaching(grid, 16) == grid

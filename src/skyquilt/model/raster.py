@@ -68,6 +68,24 @@ class Grid:
             height=-(-self.height // factor),
         )
 
+    def reaching(self, wanted: "Grid", step: int) -> "Grid":
+        """The grid, larger where another one reaches beyond it: west and north by multiples of
+        `step` pixels, so that tiles and coarser grids of such steps stay where they are.
+        """
+        west, south, east, north = wanted.bounds
+        w, s, e, n = self.bounds
+        left = max(0, int(np.ceil((w - west) / (step * self.gsd) - 1e-9)))
+        up = max(0, int(np.ceil((north - n) / (step * self.gsd) - 1e-9)))
+        right = max(0, int(np.ceil((east - e) / self.gsd - 1e-6)))
+        down = max(0, int(np.ceil((s - south) / self.gsd - 1e-6)))
+        return Grid(
+            west=w - left * (step * self.gsd),
+            north=n + up * (step * self.gsd),
+            gsd=self.gsd,
+            width=self.width + left * step + right,
+            height=self.height + up * step + down,
+        )
+
     @property
     def bounds(self) -> tuple[float, float, float, float]:
         """West, south, east, north in m (map frame)."""

@@ -100,21 +100,7 @@ class Growth:
 
     def grown(self, wanted: Grid) -> Grid:
         """The earlier grid, with what is wanted beyond it."""
-        before = self.earlier.grid
-        west, south, east, north = wanted.bounds
-        step = ALIGNED * before.gsd
-        w, s, e, n = before.bounds
-        left = max(0, int(np.ceil((w - west) / step - 1e-9)))
-        up = max(0, int(np.ceil((north - n) / step - 1e-9)))
-        right = max(0, int(np.ceil((east - e) / before.gsd - 1e-6)))
-        down = max(0, int(np.ceil((s - south) / before.gsd - 1e-6)))
-        return Grid(
-            west=w - left * step,
-            north=n + up * step,
-            gsd=before.gsd,
-            width=before.width + left * ALIGNED + right,
-            height=before.height + up * ALIGNED + down,
-        )
+        return self.earlier.grid.reaching(wanted, ALIGNED)
 
     def surface(self, grid: Grid, made: Callable[[Bounds, Grid], Surface]) -> Surface:
         """The earlier heights, with those that are made anew laid into them; `made` gives the

@@ -28,6 +28,10 @@ GreyPicture = Callable[[int, int], NDArray[np.uint8]]
 
 NONE: Mapping[int, Blank] = {}
 """No photo has marks."""
+ALIGNED = 64
+"""The map reaches further west and north than tie points told by multiples of so many pixels, so
+that cells of seams stay where they are.
+"""
 FINEST = 20
 """Largest number of map pixels per photo pixel, along a side."""
 MOST_PIXELS = 4e11
@@ -167,8 +171,9 @@ def find_ground(
 
         surface = yield from apart(told, CountedParts())
         views = tuple(make_views(alignment, surface, limits))
-        grid = grid_of(views, gsd, bounds)  # lower ground at a rim reaches further
-        grid = grid if grows is None else grows.grown(grid)
+        # ground at a rim that is lower than its tie points told reaches further
+        reach = grid_of(views, gsd, bounds)
+        grid = grid.reaching(reach, ALIGNED) if grows is None else grows.grown(reach)
     yield 1, 1
     return Ground(
         surface=surface,
