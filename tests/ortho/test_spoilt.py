@@ -139,6 +139,14 @@ def test_dust_yields_where_all_photos_show_it():
     assert shown(alignment, clean) == ({}, ())
 
 
+@pytest.mark.parametrize("apart", [30.0, 70.0])
+def test_ground_that_two_photos_show_or_one_tells_of_no_spots(apart):
+    alignment = flight(12, apart=apart)
+    grey = {i: np.full((300, 400, 3), 120, np.uint8) for i in range(12)}
+    grey[3][:, 200:] = 60
+    assert shown(alignment, grey) == ({}, ())
+
+
 def test_a_road_in_the_middle_of_every_picture_is_no_dust():
     """One line flown along a dark road: each photo has it at the same place, as has the ground."""
     ground = GROUND.copy()

@@ -125,6 +125,8 @@ def find_spots(
             continue
         size = alignment.cameras[name].width, alignment.cameras[name].height
         here = own[samples.row] & np.isfinite(darker)
+        if not here.any():  # no ground is shown by three photos
+            continue
         spot = _spots(samples.place[here], darker[here], size)
         if spot.any():
             mark = around(np.kron(spot, np.ones((FINER, FINER))) > 0, size)
@@ -145,7 +147,7 @@ def _darker(samples: Samples, number: int) -> NDArray[np.float64]:
     shown = np.bincount(samples.point)[samples.point]
     several = shown > 2
     gain = np.zeros(number)
-    for _ in range(ROUNDS):
+    for _ in range(ROUNDS if several.any() else 0):
         middle = _quartiles(
             samples.row[several], _off(samples, log - gain[samples.row])[several], number
         )[1]
@@ -178,7 +180,9 @@ def _spots(
     sigma = SIGMA_OF_QUARTILES * (high - low) / np.sqrt(np.maximum(count, 1))
     pad = np.pad(middle, WITHIN // 2, mode="reflect")
     near = np.lib.stride_tricks.sliding_window_view(pad, (WITHIN, WITHIN))
-    beside = np.nanmedian(near.reshape(*shape, -1), 2)
+    near = near.reshape(*shape, -1)
+    known = np.isfinite(near).any(2, keepdims=True)
+    beside = np.where(known[..., 0], np.nanmedian(np.where(known, near, 0.0), 2), np.nan)
     with np.errstate(invalid="ignore"):
         dark = middle - beside < -np.maximum(DARKER, SURELY * sigma)
     dark &= count >= FEWEST_VALUES
