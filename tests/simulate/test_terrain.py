@@ -118,3 +118,12 @@ def test_a_cliff_is_flown_and_low_flights_are_refused(tmp_path):
     assert "at least 70 m over cliff" in str(low.exception)
     high = CliRunner().invoke(app, ["simulate", str(tmp_path / "b"), *words, "--height", "70"])
     assert high.exit_code == 0, high.output
+
+
+def test_few_places_have_the_noise_of_many():
+    noise, land = Noise(seed=5), Grid(left=-40.3, top=22.1, res=0.7, width=90, height=70)
+    whole = noise.fractal(land, 40.0, 3.0, 0.6, 9)
+    for row, col, height, width in [(0, 0, 5, 5), (61, 80, 8, 8), (30, 41, 1, 1), (33, 12, 2, 3)]:
+        few = noise.fractal(land.window(row, col, height, width), 40.0, 3.0, 0.6, 9)
+        assert few.dtype == np.float32
+        assert few == pytest.approx(whole[row : row + height, col : col + width], abs=1e-6)

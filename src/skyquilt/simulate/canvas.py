@@ -120,16 +120,61 @@ class Canvas:
         """Paints a material where `cover` (h, w, 0-1) is above 0; `texture` is a relative change of
         brightness.
         """
-        where = cover > 0
-        change = texture[where] if isinstance(texture, np.ndarray) else np.float32(texture)
-        share = cover[where].astype(np.float32)
-        colour = material.look(self.weather)
-        old = self.look[where]
-        for band in range(4):
-            new = colour[band] * (1 + change) if band < 3 else colour[band] + WARM_K * change
-            old[:, band] += share * (new - old[:, band])
-        self.look[where] = old
+        cells = self.cells(cover > 0)
+        cells.lay(
+            material,
+            cover[cells.at].astype(np.float32),
+            texture[cells.at] if isinstance(texture, np.ndarray) else np.float32(texture),
+        )
+
+    def cells(self, where: NDArray[np.bool_]) -> "Cells":
+        """Some of the block's cells."""
+        return Cells(canvas=self, at=np.unravel_index(np.flatnonzero(where), where.shape))
 
     def _fixed(self, points: Doubles) -> NDArray[np.int32]:
         pixels = np.clip(self.grid.pixels(points), -30000, 30000)
         return np.asarray(np.round(pixels * 2**_SHIFT).astype(np.int32))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Cells:
+    """Some cells of a block as lists (n,): strips cover little of it, and cost what they cover."""
+
+    canvas: Canvas
+    """The block."""
+    at: tuple[NDArray[np.intp], ...]
+    """Rows and columns (n,) of the cells."""
+
+    @cached_property
+    def grain(self) -> Floats:
+        """(n,) as the canvas's, like all that follow."""
+        return np.asarray(self.canvas.grain[self.at])
+
+    @cached_property
+    def fine(self) -> Floats:
+        """(n,)."""
+        return np.asarray(self.canvas.fine[self.at])
+
+    @cached_property
+    def patchy(self) -> Floats:
+        """(n,)."""
+        return np.asarray(self.canvas.patchy[self.at])
+
+    @cached_property
+    def broad(self) -> Floats:
+        """(n,)."""
+        return np.asarray(self.canvas.broad[self.at])
+
+    def lay(self, material: Material, share: Floats, texture: Floats | np.float32) -> None:
+        """Paints a material that covers shares (n,) of the cells; `texture` as for `Canvas.lay`."""
+        colour = material.look(self.canvas.weather)
+        old = self.canvas.look[self.at]
+        for band in range(4):
+            new = colour[band] * (1 + texture) if band < 3 else colour[band] + WARM_K * texture
+            old[:, band] += share * (new - old[:, band])
+        self.canvas.look[self.at] = old
+
+    def flatten(self, share: Floats) -> None:
+        """Brings the surface down to the bare ground by shares (n,) of its height."""
+        height = self.canvas.height[self.at]
+        self.canvas.height[self.at] = height + share * (self.canvas.ground[self.at] - height)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.simulate import materials as m
-from skyquilt.simulate.canvas import WARM_K, Canvas
+from skyquilt.simulate.canvas import WARM_K, Canvas, Cells
 from skyquilt.simulate.grid import Doubles, Floats
 from skyquilt.simulate.layout import Layout, Parcel, Road
 from skyquilt.simulate.terrain import WATER_M, Terrain, deck
@@ -119,11 +119,10 @@ def paint_borders(canvas: Canvas, layout: Layout) -> None:
             strip = cv2.GaussianBlur(
                 canvas.line(parcel.outline, 1.5), (0, 0), 0.25 / canvas.grid.res
             )
-            cover = np.clip((strip - 0.5 + 0.16 * canvas.patchy) * 6 + 0.5, 0, 1) * (strip > 0.02)
-            canvas.lay(
-                m.MEADOW, cover, 0.08 * canvas.fine + 0.05 * canvas.grain + 0.08 * canvas.patchy
-            )
-            canvas.height[...] += cover * (canvas.ground - canvas.height)
+            cells = canvas.cells(strip > 0.02)
+            share = np.clip((strip[cells.at] - 0.5 + 0.16 * cells.patchy) * 6 + 0.5, 0, 1)
+            cells.lay(m.MEADOW, share, 0.08 * cells.fine + 0.05 * cells.grain + 0.08 * cells.patchy)
+            cells.flatten(share)
 
 
 def paint_roads(canvas: Canvas, layout: Layout) -> None:
@@ -140,27 +139,23 @@ def paint_roads(canvas: Canvas, layout: Layout) -> None:
                 layer(canvas, road)
 
 
-def _flatten(canvas: Canvas, cover: Floats) -> None:
-    canvas.height[...] += cover * (canvas.ground - canvas.height)
-
-
 def _shoulder(canvas: Canvas, road: Road) -> None:
-    shoulder = canvas.line(road.line, road.width + 1.2)
-    canvas.lay(m.GRAVEL, shoulder * 0.7, 0.10 * canvas.fine + 0.08 * canvas.grain)
-    _flatten(canvas, shoulder)
+    cells, share = _strip(canvas, canvas.line(road.line, road.width + 1.2))
+    cells.lay(m.GRAVEL, share * 0.7, 0.10 * cells.fine + 0.08 * cells.grain)
+    cells.flatten(share)
 
 
 def _lanes(canvas: Canvas, road: Road) -> None:
-    texture = (
-        0.018 * canvas.grain + 0.02 * canvas.fine + 0.035 * canvas.patchy + 0.03 * canvas.broad
-    )
-    canvas.lay(m.ASPHALT, canvas.line(road.line, road.width), texture)
+    cells, share = _strip(canvas, canvas.line(road.line, road.width))
+    texture = 0.018 * cells.grain + 0.02 * cells.fine + 0.035 * cells.patchy + 0.03 * cells.broad
+    cells.lay(m.ASPHALT, share, texture)
 
 
 def _marks(canvas: Canvas, road: Road) -> None:
     dashes = [dash for dash in _dashes(road.line)[1:-1] if canvas.touches(dash, 1.0)]
     if dashes:
-        canvas.lay(m.PAINT, canvas.line(dashes, 0.16), 0.04 * canvas.fine)
+        cells, share = _strip(canvas, canvas.line(dashes, 0.16))
+        cells.lay(m.PAINT, share, 0.04 * cells.fine)
 
 
 def _dashes(line: Doubles) -> list[Doubles]:
@@ -169,11 +164,19 @@ def _dashes(line: Doubles) -> list[Doubles]:
 
 
 def _track(canvas: Canvas, road: Road) -> None:
-    cover = canvas.line(road.line, road.width)
-    _flatten(canvas, cover)
-    canvas.lay(m.GRAVEL, cover, 0.08 * canvas.fine + 0.06 * canvas.grain + 0.09 * canvas.patchy)
+    cells, share = _strip(canvas, canvas.line(road.line, road.width))
+    cells.flatten(share)
+    cells.lay(m.GRAVEL, share, 0.08 * cells.fine + 0.06 * cells.grain + 0.09 * cells.patchy)
     middle = cv2.GaussianBlur(canvas.line(road.line, 0.7), (0, 0), 0.12 / canvas.grid.res)
-    canvas.lay(m.MEADOW, np.clip(middle * (0.8 + 0.5 * canvas.patchy), 0, 1), 0.1 * canvas.fine)
+    cells, share = _strip(canvas, np.asarray(middle))
+    share = np.clip(share * (0.8 + 0.5 * cells.patchy), 0, 1)
+    cells.lay(m.MEADOW, share, 0.1 * cells.fine)
+
+
+def _strip(canvas: Canvas, cover: Floats) -> tuple[Cells, Floats]:
+    """The cells that a strip touches, and the shares (n,) that it covers of them."""
+    cells = canvas.cells(cover > 0)
+    return cells, np.asarray(cover[cells.at])
 
 
 def paint_ponds(canvas: Canvas, layout: Layout) -> None:
@@ -181,12 +184,13 @@ def paint_ponds(canvas: Canvas, layout: Layout) -> None:
     for shore in layout.ponds:
         if not canvas.touches(shore, 3.0):
             continue
-        reed = canvas.line(np.vstack([shore, shore[:1]]), 2.2) * (canvas.patchy > -0.3)
-        canvas.lay(m.REED, reed, 0.2 * canvas.fine + 0.12 * canvas.grain)
-        canvas.height[...] += reed * np.clip(0.8 + 0.4 * canvas.fine, 0, 2)
-        water = canvas.polygon(shore)
-        canvas.lay(m.WATER, water, 0.05 * canvas.broad + 0.012 * canvas.patchy)
-        canvas.height[...] += water * (canvas.ground - canvas.height)
+        cells, reed = _strip(canvas, canvas.line(np.vstack([shore, shore[:1]]), 2.2))
+        reed = reed * (cells.patchy > -0.3)
+        cells.lay(m.REED, reed, 0.2 * cells.fine + 0.12 * cells.grain)
+        canvas.height[cells.at] += reed * np.clip(0.8 + 0.4 * cells.fine, 0, 2)
+        cells, water = _strip(canvas, canvas.polygon(shore))
+        cells.lay(m.WATER, water, 0.05 * cells.broad + 0.012 * cells.patchy)
+        cells.flatten(water)
 
 
 def paint_shape(canvas: Canvas, kind: Terrain) -> None:

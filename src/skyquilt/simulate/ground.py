@@ -141,7 +141,7 @@ def _enlarged(field: Callable[[Grid], Floats], grid: Grid, factor: int) -> Float
     values = field(large)
     across = _linear(u, values.shape[1])
     down = _linear(v, values.shape[0])
-    return np.ascontiguousarray((across @ (down @ values).T).T)
+    return np.asarray(cv2.transpose(across @ (down @ values).T))
 
 
 def _linear(positions: Floats, count: int) -> sparse.csr_matrix:

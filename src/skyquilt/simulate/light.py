@@ -59,9 +59,10 @@ def _shadow(height: Floats, res: float, sun: Floats) -> Floats:
 def _shifted(raster: Floats, dx: float, dy: float) -> Floats:
     """The raster shifted by `dx`, `dy` cells: out(r, c) = raster(r + dy, c + dx)."""
     h, w = raster.shape
-    dx, dy = round(dx), round(dy)
-    rows, cols = np.clip(np.arange(h) + dy, 0, h - 1), np.clip(np.arange(w) + dx, 0, w - 1)
-    return raster[rows][:, cols]
+    dx, dy = int(np.clip(round(dx), 1 - w, w - 1)), int(np.clip(round(dy), 1 - h, h - 1))
+    stays = raster[max(dy, 0) : h + min(dy, 0), max(dx, 0) : w + min(dx, 0)]
+    above, below, left, right = max(-dy, 0), max(dy, 0), max(-dx, 0), max(dx, 0)
+    return np.asarray(cv2.copyMakeBorder(stays, above, below, left, right, cv2.BORDER_REPLICATE))
 
 
 def shine(look: Floats, direct: Floats, weather: Weather) -> Floats:
@@ -69,8 +70,9 @@ def shine(look: Floats, direct: Floats, weather: Weather) -> Floats:
     shines.
     """
     strength = np.float32(0.25 + 0.75 * weather.strength)
-    sun, sky = (1 - _AMBIENT) * direct[..., None] * _SUN_TINT, _AMBIENT * _SKY_TINT
+    sun, sky = (1 - _AMBIENT) * direct, _AMBIENT * _SKY_TINT
     out = look.copy()
-    out[..., :3] *= strength * (sun + sky)
+    for band in range(3):
+        out[..., band] *= strength * (sun * _SUN_TINT[band] + sky[band])
     out[..., 3] += np.float32(7.0 * weather.warmth) * (np.minimum(direct, 1.3) - 1)
     return out

@@ -161,7 +161,7 @@ def _march(raster: Floats, lines: Floats, above: Floats, below: Floats, steps: i
 
 def _surface(raster: Floats, lines: Floats, z: Floats) -> Floats:
     """Heights (n,) of the raster where rays have the heights z (n,)."""
-    x, y = lines[0] - z * lines[2], lines[1] - z * lines[3]
+    x, y = (np.subtract(lines[i], a, out=a) for i, a in enumerate((z * lines[2], z * lines[3])))
     count, wide = len(z), 1024  # lists as rows of this length: images have at most 32767
     rows = -(-count // wide)
     if rows * wide > count:
@@ -178,18 +178,22 @@ def _polish(
 ) -> Floats:
     """Refines the intersection between heights above and below the surface."""
     for k in range(5):
-        share = (
-            np.float32(0.5)
-            if k in (0, 2)
-            else np.clip(f_over / (f_over - f_under - 1e-9), 0.02, 0.98)
-        )
+        share = np.float32(0.5) if k in (0, 2) else _share(f_over, f_under, 0.02, 0.98)
         z = z_over + (z_under - z_over) * share
         f = _surface(raster, lines, z) - z
         hit = f >= 0
         z_under, f_under = np.where(hit, z, z_under), np.where(hit, f, f_under)
         z_over, f_over = np.where(hit, z_over, z), np.where(hit, f_over, f)
-    share = np.clip(f_over / (f_over - f_under - 1e-9), 0, 1)
-    return np.asarray(z_over + (z_under - z_over) * share)
+    return np.asarray(z_over + (z_under - z_over) * _share(f_over, f_under, 0.0, 1.0))
+
+
+def _share(f_over: Floats, f_under: Floats, least: float, most: float) -> Floats:
+    """Where (n,) between two heights the surface is met, if it is straight between them."""
+    share = f_over - f_under
+    share -= np.float32(1e-9)
+    np.divide(f_over, share, out=share)
+    np.maximum(share, np.float32(least), out=share)
+    return np.minimum(share, np.float32(most), out=share)
 
 
 def first_hits(raster: Floats, rays: Rays) -> tuple[Floats, Floats]:
