@@ -3,6 +3,7 @@
 python benchmarks/large_flight.py FOLDER [--photos 2000]    2 MP photos from three drones
                                           [--jobs 2]         by two processes
 python benchmarks/large_flight.py FOLDER --kind small       300 photos of 0.3 MP from three drones
+python benchmarks/large_flight.py FOLDER --kind tiny        300 photos of 0.17 MP
 python benchmarks/large_flight.py FOLDER --kind dense       172 photos of 0.5 MP, 87 % overlap
 python benchmarks/large_flight.py FOLDER --kind wing        167 photos of 9.7 MP, 50 % overlap
 
@@ -44,6 +45,7 @@ from skyquilt.simulate.truth import write_truth
 KINDS = {
     "large": (Lens(), Route(photos=2000, drones=3)),
     "small": (Lens(width=640, height=480, focal=533.0), Route(photos=300, drones=3)),
+    "tiny": (Lens(width=480, height=360, focal=400.0), Route(photos=300, drones=3)),
     "dense": (
         Lens(width=816, height=612, focal=680.0),
         Route(photos=172, overlap=0.87, sidelap=0.7, height=40.0),

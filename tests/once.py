@@ -1,11 +1,22 @@
-"""Flights that are simulated once for all processes that run tests beside one another."""
+"""Flights that are simulated once for all processes that run tests beside one another, and pictures
+that are looked at once by each.
+"""
 
+import copy
 import fcntl
+import hashlib
 import os
+from collections import OrderedDict
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from unittest import mock
 
+import numpy as np
 import pytest
 
+from skyquilt.matching.sift import Sift
+from skyquilt.model.features import Features
 from skyquilt.simulate import FlightSettings, simulate
 
 
@@ -23,3 +34,26 @@ def flown_once(temporary: pytest.TempPathFactory, name: str, settings: FlightSet
                 pass
             whole.touch()
     return folder
+
+
+PICTURES = 200
+"""Pictures whose features are remembered, those seen last: some hundred MB."""
+
+
+@contextmanager
+def seen_once() -> Iterator[None]:
+    """What SIFT finds on the same picture again, in another test, is remembered in this process."""
+    honest, found = Sift.of_shrunken, OrderedDict[object, Features]()
+
+    def remembered(sift: Sift, small: np.ndarray, full: tuple[int, int]) -> Features:
+        picture = hashlib.sha256(np.ascontiguousarray(small)).digest()
+        key = (sift, picture, small.shape, small.dtype.str, full)
+        known = found.pop(key, None)
+        known = honest(sift, small, full) if known is None else known
+        found[key] = known
+        if len(found) > PICTURES:
+            found.popitem(last=False)
+        return copy.deepcopy(known)
+
+    with mock.patch.object(Sift, "of_shrunken", remembered):
+        yield

@@ -1,8 +1,6 @@
 """A small flight of known truth, the command line in this process, and ways to spoil photos."""
 
 import contextlib
-import copy
-import hashlib
 import io
 import json
 import os
@@ -23,12 +21,10 @@ from PIL import Image
 
 from skyquilt.cli.main import run
 from skyquilt.engine.folder import CONTRACT
-from skyquilt.matching.sift import Sift
-from skyquilt.model.features import Features
 from skyquilt.simulate import FlightSettings
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, Route
-from tests.once import flown_once
+from tests.once import flown_once, seen_once
 from tests.photos.conftest import gps_exif, with_segment
 
 QUICK = ("--features", "300", "--surface", "ties", "--gsd", "30", "--jobs", "2")
@@ -136,19 +132,8 @@ def skyquilt(*words: str | Path) -> tuple[int, str, str]:
 
 @pytest.fixture(scope="package", autouse=True)
 def pictures_seen_before() -> Iterator[None]:
-    """What SIFT finds on the same picture again, in another test, is remembered in this process:
-    the tests here are about all that follows, and it is half of a run's time.
-    """
-    honest, found = Sift.of_shrunken, {}
-
-    def remembered(sift: Sift, small: np.ndarray, full: tuple[int, int]) -> Features:
-        picture = hashlib.sha256(np.ascontiguousarray(small)).digest()
-        key = (sift, picture, small.shape, small.dtype.str, full)
-        if key not in found:
-            found[key] = honest(sift, small, full)
-        return copy.deepcopy(found[key])
-
-    with mock.patch.object(Sift, "of_shrunken", remembered):
+    """The tests here are about all that follows SIFT, which is half of a run's time."""
+    with seen_once():
         yield
 
 

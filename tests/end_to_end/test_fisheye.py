@@ -11,7 +11,7 @@ import pytest
 from skyquilt.simulate import FlightSettings
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, Reporting, Route
-from tests.end_to_end.conftest import named
+from tests.end_to_end.conftest import Told, named, skyquilt
 from tests.once import flown_once
 
 pytestmark = pytest.mark.slow
@@ -30,7 +30,18 @@ def wide(tmp_path_factory):
     return flown_once(tmp_path_factory, "fisheye", settings)
 
 
-FULL = ("--features", "1500", "--gsd", "12", "--surface", "sweep")
+@pytest.fixture(scope="module")
+def mapped(wide, tmp_path_factory):
+    """Their map, with heights from pictures and control points."""
+    output = tmp_path_factory.mktemp("mapped") / "out"
+    full = (*PLACED, "--gsd", "12", "--surface", "sweep", "--jobs", "2")
+    gcp = wide / "gcp_list.txt"
+    code, out, err = skyquilt("mosaic", wide / "photos", "-o", output, *full, "--gcp", gcp)
+    return Told(code=code, out=out, err=err, output=output).made()
+
+
+PLACED = ("--features", "1500")
+"""Photos are placed as in `mapped`; their map is a coarse one over points."""
 
 
 def placed_off_m(output, wide):
@@ -46,9 +57,8 @@ def placed_off_m(output, wide):
     )
 
 
-def test_a_fisheye_is_found_and_calibrated(mosaic, wide):
-    run = mosaic(wide / "photos", *FULL, "--gcp", wide / "gcp_list.txt").made()
-    m = run.metrics
+def test_a_fisheye_is_found_and_calibrated(mapped, wide):
+    m = mapped.metrics
     assert m["blocks"] == [12]
     assert any("fisheye" in w for w in m["warnings"])
     assert m["reprojection_error_px"]["rms"] < 0.4
@@ -63,14 +73,12 @@ def test_a_fisheye_is_found_and_calibrated(mosaic, wide):
     gsd = 50 / truth["focal"]
     rms = np.sqrt((checks**2).mean(0))
     assert len(checks) >= 4 and max(rms[:2]) < gsd and rms[2] < 2 * gsd
-    (record,) = json.loads((run.output / "cameras.json").read_text()).values()
+    (record,) = json.loads((mapped.output / "cameras.json").read_text()).values()
     assert record["projection_type"] == "fisheye62"
 
 
-def test_its_own_cameras_json_tells_the_kind_beforehand(mosaic, wide, tmp_path):
-    first = mosaic(wide / "photos", *FULL, output=tmp_path / "first").made()
-    cameras = first.output / "cameras.json"
-    told = mosaic(wide / "photos", *FULL, "--cameras", cameras, output=tmp_path / "told").made()
+def test_its_own_cameras_json_tells_the_kind_beforehand(mosaic, mapped, wide):
+    told = mosaic(wide / "photos", *PLACED, "--cameras", mapped.output / "cameras.json").made()
     assert not any("fisheye" in w for w in told.metrics["warnings"])
     (camera,) = told.metrics["cameras"].values()
     assert camera["projection"] == "fisheye" and told.metrics["blocks"] == [12]
@@ -81,10 +89,10 @@ def test_photos_are_added_to_its_map(mosaic, wide, tmp_path):
     folder = Path(shutil.copytree(wide / "photos", tmp_path / "photos"))
     late = named(folder)[9:]
     aside = [path.rename(tmp_path / path.name) for path in late]
-    mosaic(folder, *FULL).made()
+    mosaic(folder, *PLACED).made()
     for path in aside:
         path.rename(folder / path.name)
-    m = mosaic(folder, *FULL, "--add").made().metrics
+    m = mosaic(folder, *PLACED, "--add").made().metrics
     assert m["blocks"] == [12] and m["added"]["photos"] == 3
     (camera,) = m["cameras"].values()
     assert camera["projection"] == "fisheye"
@@ -93,7 +101,7 @@ def test_photos_are_added_to_its_map(mosaic, wide, tmp_path):
 
 @pytest.mark.parametrize("method", ["image", "flightline"])
 def test_mosaics_in_the_plane_find_it_too(mosaic, wide, method):
-    run = mosaic(wide / "photos", "--gsd", "12", "--method", method).made()
+    run = mosaic(wide / "photos", "--method", method).made()
     assert sum(run.metrics["blocks"]) == 12
     assert any("fisheye" in w for w in run.metrics["warnings"])
     assert np.median(placed_off_m(run.output, wide)) < 3.5  # positions of 2 m

@@ -66,6 +66,14 @@ def same_result(a: Path, b: Path) -> None:
     assert figures[0] == figures[1]
 
 
+@pytest.fixture
+def again(finished, tmp_path) -> Path:
+    """The undisturbed run, copied to where `mosaic` makes its own: another run would tell no more
+    of what happens to a finished one.
+    """
+    return Path(shutil.copytree(finished, tmp_path / "out"))
+
+
 # who may write
 
 
@@ -238,14 +246,13 @@ def test_a_folder_of_other_files_is_left_alone(mosaic, flight, tmp_path):
     assert (tmp_path / "out" / "thesis.doc").read_text() == "years of work"
 
 
-def test_another_run_is_replaced_only_when_asked_for(mosaic, flight):
-    output = mosaic(flight / "photos").made().output
-    before = {n: (output / n).read_bytes() for n in CONTRACT}
+def test_another_run_is_replaced_only_when_asked_for(mosaic, flight, again):
+    before = {n: (again / n).read_bytes() for n in CONTRACT}
     told = mosaic(flight / "photos", "--blend", "first")
     assert told.code == 5
     assert "already holds another run" in told.err
     assert "--overwrite" in told.err
-    assert {n: (output / n).read_bytes() for n in CONTRACT} == before
+    assert {n: (again / n).read_bytes() for n in CONTRACT} == before
     told = mosaic(flight / "photos", "--blend", "first", "--overwrite", "--json").made()
     reused = {e["stage"]: e["reused"] for e in told.events if e["event"] == "StageFinished"}
     kept = ("features", "links", "align", "surface", "balance")
@@ -263,27 +270,25 @@ def test_the_same_run_again_does_nothing(mosaic, flight, finished):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("again")
 def test_other_threads_and_memory_are_the_same_run(mosaic, flight):
-    mosaic(flight / "photos").made()
     assert "nothing to do" in mosaic(flight / "photos", "--jobs", "1", "--memory", "2").made().err
 
 
 @pytest.mark.parametrize(
     "lost", [*map(late, ("report.html", "mosaic.tif", "metrics.json", "run.toml"))]
 )
-def test_a_file_that_was_deleted_is_made_again(mosaic, flight, finished, lost):
-    output = mosaic(flight / "photos").made().output
-    (output / lost).unlink()
+def test_a_file_that_was_deleted_is_made_again(mosaic, flight, finished, again, lost):
+    (again / lost).unlink()
     told = mosaic(flight / "photos", "--json").made()
     reused = {e["stage"]: e["reused"] for e in told.events if e["event"] == "StageFinished"}
     assert all(reused[s] for s in ("features", "links", "align", "surface"))
     assert reused["mosaic"] == (lost != "mosaic.tif")
-    same_result(output, finished)
+    same_result(again, finished)
 
 
 @pytest.mark.parametrize("stage", ["mosaic", *(late(s) for s in STAGES[1:] if s != "mosaic")])
-def test_rerun_from_each_stage(mosaic, flight, finished, stage):
-    output = mosaic(flight / "photos").made().output
+def test_rerun_from_each_stage(mosaic, flight, finished, again, stage):
     told = mosaic(flight / "photos", "--rerun-from", stage, "--json").made()
     reused = {e["stage"]: e["reused"] for e in told.events if e["event"] == "StageFinished"}
     stored = {"features", "links", "align", "surface", "balance", "seams", "mosaic"}
@@ -291,34 +296,31 @@ def test_rerun_from_each_stage(mosaic, flight, finished, stage):
     assert reused == {
         s: s in stored and k + 1 < first for k, s in enumerate(STAGES[1:]) if s != "frames"
     }
-    same_result(output, finished)
+    same_result(again, finished)
 
 
-def test_damaged_intermediate_results_are_made_again(mosaic, flight, finished):
-    output = mosaic(flight / "photos").made().output
-    for number, path in enumerate(sorted((output / ".skyquilt" / "store").rglob("*.npz"))):
+def test_damaged_intermediate_results_are_made_again(mosaic, flight, finished, again):
+    for number, path in enumerate(sorted((again / ".skyquilt" / "store").rglob("*.npz"))):
         data = path.read_bytes()
         path.write_bytes(
             (b"", data[:100], data[: len(data) // 2], data[:-1], bytes(len(data)))[number % 5]
         )
-    (output / "report.html").unlink()
+    (again / "report.html").unlink()
     mosaic(flight / "photos").made()
-    same_result(output, finished)
+    same_result(again, finished)
 
 
 @pytest.mark.slow
-def test_a_damaged_state_is_another_run_not_a_crash(mosaic, flight):
-    output = mosaic(flight / "photos").made().output
-    (output / ".skyquilt" / "run.json").write_text('{"key": ')
+def test_a_damaged_state_is_another_run_not_a_crash(mosaic, flight, again):
+    (again / ".skyquilt" / "run.json").write_text('{"key": ')
     told = mosaic(flight / "photos")
     assert told.code == 5
     assert "--overwrite" in told.err
 
 
 @pytest.mark.slow
-def test_damaged_figures_of_a_finished_run_are_made_again(mosaic, flight):
-    output = mosaic(flight / "photos").made().output
-    (output / "metrics.json").write_text('{"photos_total": ')
+def test_damaged_figures_of_a_finished_run_are_made_again(mosaic, flight, again):
+    (again / "metrics.json").write_text('{"photos_total": ')
     assert mosaic(flight / "photos").made().metrics["photos_used"] == 9
 
 

@@ -3,7 +3,6 @@ is the oracle.
 """
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -133,9 +132,8 @@ def test_values_are_degrees_and_their_drift_is_balanced(flights, output):
 
 @pytest.mark.slow
 def test_raw_values_on_request(flights, tmp_path):
-    told = joined(
-        flights, tmp_path / "out", "positions", replace(SETTINGS, balance_thermal=False, gsd_cm=15)
-    )
+    raw = SETTINGS.changed(balance_thermal=False, gsd_cm=30.0, features=500, surface="ties")
+    told = joined(flights, tmp_path / "out", "positions", raw)
     assert not told["thermal_values"]["balanced"] and told["thermal_values"]["offsets"] == {}
     with rasterio.open(tmp_path / "out" / "thermal.tif") as out:
         assert out.tags()["DRIFT"] == "as recorded"
