@@ -86,7 +86,7 @@ def site(run):
     survey = open_survey(run)
     with (
         ServerThread(survey=survey, guard=Guard(token="looking-only"), folder=run) as serving,
-        httpx.Client(base_url=serving.url, timeout=60) as web,
+        httpx.Client(base_url=serving.url, timeout=60, verify=False) as web,
     ):
         yield web
 
@@ -181,7 +181,7 @@ def test_photos_are_shown_only_with_the_content_of_the_run(tmp_path):
     def shown(**more):
         survey = open_survey(run, **more)
         with ServerThread(survey=survey, guard=Guard(token="looking-only"), folder=run) as serving:
-            return httpx.get(serving.url + "photos/1/file")
+            return httpx.get(serving.url + "photos/1/file", verify=False)
 
     assert shown().content == jpeg()
     moved = tmp_path / "moved"
@@ -225,23 +225,23 @@ def test_a_final_map_that_is_being_replaced_is_not_shown_for_that_time(run, tmp_
     ) as serving:
 
         def layers():
-            answer = httpx.get(serving.url + "info")
+            answer = httpx.get(serving.url + "info", verify=False)
             assert answer.status_code == 200
             return [layer["name"] for layer in answer.json()["layers"]]
 
         for begun in (b"", b"II*\0", (run / "mosaic.tif").read_bytes()[:40]):
             final.write_bytes(begun)
             assert layers() == []
-            capabilities = httpx.get(serving.url + "wms?REQUEST=GetCapabilities")
+            capabilities = httpx.get(serving.url + "wms?REQUEST=GetCapabilities", verify=False)
             assert capabilities.status_code == 200
             assert b"finished" not in capabilities.content
-            assert httpx.get(serving.url + "at?lon=15&lat=52").status_code == 200
+            assert httpx.get(serving.url + "at?lon=15&lat=52", verify=False).status_code == 200
         shutil.copy(run / "mosaic.tif", final)
         assert layers() == ["finished"]
         final.unlink()
         assert layers() == []
         for lost in ("tiles/5/17/10?", "tiles.json?", "export?bbox=14,51,16,53&"):
-            assert httpx.get(f"{serving.url}{lost}layer=finished").status_code == 404
+            assert httpx.get(f"{serving.url}{lost}layer=finished", verify=False).status_code == 404
         shutil.copy(run / "mosaic.tif", final)
 
         # after it was found, before it is read
@@ -261,14 +261,16 @@ def test_tiles_of_a_final_map_that_was_made_again_are_the_new_ones(run, tmp_path
     with ServerThread(
         survey=open_survey(tmp_path / "out"), guard=Guard(), folder=tmp_path / "out"
     ) as serving:
-        west, south, east, north = httpx.get(serving.url + "info").json()["layers"][0]["bounds"]
+        west, south, east, north = httpx.get(serving.url + "info", verify=False).json()["layers"][
+            0
+        ]["bounds"]
         zoom = 2**16
         x = int(((west + east) / 2 + 180) / 360 * zoom)
         phi = np.radians((south + north) / 2)
         y = int((1 - np.log(np.tan(phi) + 1 / np.cos(phi)) / np.pi) / 2 * zoom)
 
         def tile():
-            answer = httpx.get(f"{serving.url}tiles/16/{x}/{y}?layer=finished")
+            answer = httpx.get(f"{serving.url}tiles/16/{x}/{y}?layer=finished", verify=False)
             assert answer.status_code == 200
             return answer.content
 
@@ -323,7 +325,7 @@ def test_half_sent_headers_keep_nobody_out(run, monkeypatch):
     guard = Guard(token="looking-only", most_connections=40)
     with ServerThread(survey=open_survey(run), guard=guard, folder=run) as serving:
         half = [opened(serving.port) for _ in range(120)]
-        assert httpx.get(serving.url + "info").status_code == 200
+        assert httpx.get(serving.url + "info", verify=False).status_code == 200
         ended = 0
         for one in half:
             one.settimeout(3)
@@ -339,7 +341,7 @@ def test_half_sent_headers_keep_nobody_out(run, monkeypatch):
 def test_a_client_that_takes_no_answer_is_disconnected(run, monkeypatch):
     monkeypatch.setattr(connections, "SENDING_S", 1.0)
     with ServerThread(survey=open_survey(run), guard=Guard(token="looking-only"), folder=run) as s:
-        with httpx.Client(base_url=s.url) as web:
+        with httpx.Client(base_url=s.url, verify=False) as web:
             query = f"{MAP}&BBOX={box(web)}&LAYERS=mosaic&WIDTH=2000&HEIGHT=2000"
         one = socket.socket()
         one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
@@ -458,7 +460,7 @@ def test_the_viewer_ends_with_its_parent_and_the_port_is_free_at_once(tmp_path):
     for _ in range(3):
         with subprocess.Popen(command, env=env, stdout=subprocess.PIPE, text=True) as running:
             assert running.stdout.readline().startswith("http://127.0.0.1")
-            assert httpx.get(f"http://127.0.0.1:{port}/info").status_code == 200
+            assert httpx.get(f"http://127.0.0.1:{port}/info", verify=False).status_code == 200
             running.send_signal(signal.SIGKILL)
             running.wait()
     for _ in range(50):
@@ -502,7 +504,9 @@ def test_forty_of_the_largest_images_at_once(site):
             most[0] = max(most[0], resident_mb())
 
     def ask():
-        with httpx.stream("GET", f"{site.base_url}{query[1:]}", timeout=300) as answer:
+        with httpx.stream(
+            "GET", f"{site.base_url}{query[1:]}", timeout=300, verify=False
+        ) as answer:
             said.append(answer.status_code)
             for _ in answer.iter_raw(65536):  # not kept by the client
                 pass

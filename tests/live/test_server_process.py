@@ -25,7 +25,7 @@ def until(holds, seconds=30.0):
 
 def answers(url):
     try:
-        return httpx.get(url + "info", timeout=5).status_code == 200
+        return httpx.get(url + "info", timeout=5, verify=False).status_code == 200
     except httpx.HTTPError:
         return False
 
@@ -40,7 +40,10 @@ def test_photos_handed_to_it_are_mapped_and_it_comes_back_when_killed(flight, tm
     asked = ServerConfig(
         folder=tmp_path / "out", settings=settings, guard=Guard(token="long enough")
     )
-    with ServerProcess(asked=asked) as site, httpx.Client(base_url=site.url, timeout=30) as web:
+    with (
+        ServerProcess(asked=asked) as site,
+        httpx.Client(base_url=site.url, timeout=30, verify=False) as web,
+    ):
         mapping.start()
         token = {"X-Token": "long enough"}
         data = [p.read_bytes() for p in flight.photos]
@@ -57,7 +60,9 @@ def test_photos_handed_to_it_are_mapped_and_it_comes_back_when_killed(flight, tm
         os.kill(first, signal.SIGKILL)
         until(lambda: site._parts["process"].pid != first and answers(site.url))
         assert (
-            httpx.post(site.url + "photos", content=data[1], headers=token, timeout=30).status_code
+            httpx.post(
+                site.url + "photos", content=data[1], headers=token, timeout=30, verify=False
+            ).status_code
             == 201
         )
         until(lambda: len(list(live.members.on_map())) == 2)

@@ -80,7 +80,7 @@ def test_marks_are_stored_and_written_as_the_list_that_mosaic_reads(finished, fl
     }  # fmt: skip
     survey = open_survey(finished.output)
     serving = ServerThread(survey=survey, guard=Guard(token="secret-word"), folder=finished.output)
-    with serving, httpx.Client(base_url=serving.url, timeout=30) as web:
+    with serving, httpx.Client(base_url=serving.url, timeout=30, verify=False) as web:
         mine = {"X-Token": "secret-word"}
         assert web.put("/control", json=control).status_code == 401
         assert web.post("/control/run").status_code == 401

@@ -208,7 +208,7 @@ def test_rasters_replaced_while_they_are_served(finished, tmp_path, spoil):
     survey = open_survey(folder)
     with (
         ServerThread(survey=survey, guard=Guard(), folder=folder) as serving,
-        httpx.Client(base_url=serving.url, timeout=20) as web,
+        httpx.Client(base_url=serving.url, timeout=20, verify=False) as web,
     ):
         spoil(folder / "hillshade.tif")
         offered = web.get("/wms?SERVICE=WMS&REQUEST=GetCapabilities")
