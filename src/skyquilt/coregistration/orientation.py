@@ -173,7 +173,10 @@ def turned(fields: Fields, angle: float) -> Fields:
     moved.
     """
     turn = np.exp(np.array([2j, 4j]) * angle).astype(np.complex64)
-    out = np.ascontiguousarray(fields).view(np.complex64) * turn
+    both = np.ascontiguousarray(fields).view(np.complex64)
+    out = np.empty_like(both)
+    for k in range(2):  # products of whole pictures take half the time of those of pairs
+        np.multiply(both[..., k], turn[k], out=out[..., k])
     return out.view(np.float32)
 
 
