@@ -57,3 +57,10 @@ def seen_once() -> Iterator[None]:
 
     with mock.patch.object(Sift, "of_shrunken", remembered):
         yield
+
+
+@pytest.fixture(scope="package", autouse=True)
+def pictures_seen_before() -> Iterator[None]:
+    """For packages of tests of what follows SIFT, which takes a third of a small map's time."""
+    with seen_once():
+        yield

@@ -8,7 +8,7 @@ import re
 import shutil
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from skyquilt.engine.folder import CONTRACT
 from skyquilt.simulate import FlightSettings
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, Route
-from tests.once import flown_once, seen_once
+from tests.once import flown_once, pictures_seen_before  # noqa: F401 - a fixture
 from tests.photos.conftest import gps_exif, with_segment
 
 QUICK = ("--features", "300", "--surface", "ties", "--gsd", "30", "--jobs", "2")
@@ -128,13 +128,6 @@ def skyquilt(*words: str | Path) -> tuple[int, str, str]:
         sys.argv = argv
         signal.signal(signal.SIGINT, on_interrupt)
     return code, out.getvalue(), err.getvalue()
-
-
-@pytest.fixture(scope="package", autouse=True)
-def pictures_seen_before() -> Iterator[None]:
-    """The tests here are about all that follows SIFT, which is half of a run's time."""
-    with seen_once():
-        yield
 
 
 Mosaic = Callable[..., Told]

@@ -23,7 +23,7 @@ from skyquilt.server.survey import LiveSurvey
 from skyquilt.simulate import FlightSettings
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, Reporting, Route, Thermal
-from tests.once import flown_once, seen_once
+from tests.once import flown_once, pictures_seen_before  # noqa: F401 - a fixture
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,15 +50,6 @@ def made(temporary: pytest.TempPathFactory, name: str, **settings: Any) -> Fligh
     flown = FlightSettings(**{"lens": Lens().scaled(480, 360), **settings})
     folder = flown_once(temporary, name, flown)
     return Flight(folder=folder, truth=json.loads((folder / "truth" / "truth.json").read_text()))
-
-
-@pytest.fixture(scope="package", autouse=True)
-def pictures_seen_before() -> Iterator[None]:
-    """The tests here are about what becomes of features, and many maps begin with the same six
-    photos.
-    """
-    with seen_once():
-        yield
 
 
 def fed(live: LiveMap, paths: Sequence[Path]) -> LiveMap:

@@ -1,0 +1,3 @@
+"""The tests here are about what follows SIFT."""
+
+from tests.once import pictures_seen_before  # noqa: F401 - a fixture
