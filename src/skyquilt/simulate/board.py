@@ -4,6 +4,7 @@ part by part.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -175,18 +176,29 @@ def _rays_on_board(lens: Lens, board: Chessboard, pose: BoardPose) -> Floats:
     """Column and row (height, width, 2, finer by `_OVER`) of the board's raster where each ray
     meets it; far outside where a ray misses it.
     """
-    fine = (
-        (np.arange(lens.width * _OVER) + 0.5) / _OVER - 0.5,
-        (np.arange(lens.height * _OVER) + 0.5) / _OVER - 0.5,
-    )
-    xx, yy = np.meshgrid((fine[0] - lens.cx) / lens.focal, (fine[1] - lens.cy) / lens.focal)
-    x, y = lens.undistort(xx, yy)
+    x, y = _fine_rays(lens)
     normal = pose.rotation[:, 2]
     depth = (normal @ pose.shift) / (normal[0] * x + normal[1] * y + normal[2])
     rays = np.stack([x, y, np.ones_like(x)], -1) * depth[..., None] - pose.shift
     half = np.array([board.columns, board.rows]) * board.square / 2 + board.margin
     place = (rays @ pose.rotation[:, :2] + half) / _cell(board) - 0.5
     return np.asarray(np.where(depth[..., None] > 0, place, -1e4), np.float32)
+
+
+@lru_cache(maxsize=2)
+def _fine_rays(lens: Lens) -> tuple[Doubles, Doubles]:
+    """Ideal normalised coordinates x, y (height, width, finer by `_OVER`), read-only: the same for
+    all frames of a camera.
+    """
+    fine = (
+        (np.arange(lens.width * _OVER) + 0.5) / _OVER - 0.5,
+        (np.arange(lens.height * _OVER) + 0.5) / _OVER - 0.5,
+    )
+    xx, yy = np.meshgrid((fine[0] - lens.cx) / lens.focal, (fine[1] - lens.cy) / lens.focal)
+    x, y = lens.undistort(xx, yy)
+    x.setflags(write=False)
+    y.setflags(write=False)
+    return x, y
 
 
 def _lamp_at(share: float, lamp: Lamp, size: Doubles) -> tuple[float, float]:

@@ -3,7 +3,7 @@ sensor.
 """
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 
 import cv2
 import numpy as np
@@ -160,10 +160,18 @@ def with_waves(
     return out
 
 
+@lru_cache(maxsize=2)
+def _rays(lens: Lens) -> Floats:
+    """`Lens.rays`, read-only: the same for all flights with a lens."""
+    rays = lens.rays()
+    rays.setflags(write=False)
+    return rays
+
+
 def exposer(scene: Scene, lens: Lens) -> Exposer:
     """Prepares a camera over a scene."""
     lowest = float(scene.height[::16, ::16].min()) - 1.0
-    return Exposer(scene=scene, lens=lens, directions=lens.rays(), lowest=lowest)
+    return Exposer(scene=scene, lens=lens, directions=_rays(lens), lowest=lowest)
 
 
 def footprint(lens: Lens, shot: Shot, level: float) -> Doubles:
