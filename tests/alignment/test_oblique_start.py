@@ -207,6 +207,17 @@ def test_photos_that_an_adjustment_turned_are_taken_to_report_that():
     assert turned_priors(found, nowhere) is None
 
 
+def test_walls_around_what_photos_show_from_above_are_told():
+    flown = Slanting([*orbit(20, 50), *grid(2)[:5]])
+    found = replace(flown.aligned(), poses=dict(enumerate(flown.truth)))
+    (says,) = tilt_warnings(flown.priors, found)
+    assert "20 of 25 photos look aslant" in says and "--max-view-angle 40" in says
+    assert tilt_warnings(flown.priors, found, 40.0) == []
+    round_about = Slanting(orbit(20, 50))
+    found = replace(found, poses=dict(enumerate(round_about.truth)))
+    assert tilt_warnings(round_about.priors, found) == []  # nothing is shown from above
+
+
 def test_an_orbit_begun_as_if_it_looked_down_is_begun_again(monkeypatch):
     """The first adjustment ends with the whole block tilted by ten degrees."""
     flown = Slanting(orbit(20, 50), seed=1)

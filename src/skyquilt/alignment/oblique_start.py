@@ -28,6 +28,10 @@ ASLANT_DEG = 10.0
 APART = np.sin(np.radians(5.0))
 """Sine of the least angle between two rays that tell where they meet, positions erring by metres.
 """
+VERTICAL_DEG, LEVEL_SHARE = 15.0, 0.1
+"""Photos tilted by less look straight down; with fewer of them a survey has none to speak of."""
+FROM_ABOVE_DEG = 40.0
+"""View angle up to which a map shows ground and roofs rather than walls, about."""
 NEARER = 0.95
 """Photos come nearer to their positions where their distance falls by this factor."""
 LOST = 0.8
@@ -72,14 +76,31 @@ def turned_far(found: Alignment, priors: Sequence[Prior]) -> bool:
     return not tilts_reported(priors) and far > MOST_OBLIQUE * len(found.held)
 
 
-def tilt_warnings(priors: Sequence[Prior], found: Alignment) -> list[str]:
-    """A sentence where an oblique survey was placed without its camera angles."""
+def tilt_warnings(
+    priors: Sequence[Prior], found: Alignment, most_view_deg: float = 90.0
+) -> list[str]:
+    """A sentence where an oblique survey was placed without its camera angles, or where oblique
+    photos lie around vertical ones. `most_view_deg`: angle from the nadir up to which they are
+    drawn.
+    """
     if not turned_far(found, priors):
-        return []
+        return _walls(priors, found, most_view_deg)
     return [
         "Most photos look far from straight down, and none reports its camera angles: heights,"
         " scale and tilt of the map rest on positions alone. Compare it with known distances, or"
         " give camera angles or control points."
+    ]
+
+
+def _walls(priors: Sequence[Prior], found: Alignment, most_view_deg: float) -> list[str]:
+    tilts = np.array([tilt_deg(found.poses[i].cam_R_map) for i in found.held])
+    level = int((tilts < VERTICAL_DEG).sum())
+    if not slanting(priors) or level < LEVEL_SHARE * len(tilts) or most_view_deg <= FROM_ABOVE_DEG:
+        return []
+    return [
+        f"{len(tilts) - level} of {len(tilts)} photos look aslant: around what the other {level}"
+        " show from above, the map shows walls and the sides of trees. --max-view-angle"
+        f" {FROM_ABOVE_DEG:.0f} leaves such places out; the photos still support the heights."
     ]
 
 

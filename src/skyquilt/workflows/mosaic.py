@@ -398,7 +398,7 @@ def _metrics(
                 *aligned.found.warnings,
                 *aligned.links.notes,
                 *contradictions(aligned.priors, alignment),
-                *tilt_warnings(aligned.priors, alignment),
+                *tilt_warnings(aligned.priors, alignment, settings.picture.max_view_angle),
                 *stretch_warnings(alignment.frame),
             ],
             notes=[*survey.notes, *alignment.notes, *ground.notes],
