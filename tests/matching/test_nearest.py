@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyquilt.matching.candidates import Nearest, Retrieval, sequence
+from skyquilt.matching.candidates import Nearest, Retrieval, by_camera, sequence
 from skyquilt.matching.sift import Sift
 from skyquilt.model.features import Features
 from tests.texture import texture
@@ -122,3 +122,47 @@ def test_photos_without_features_do_no_harm(flown):
         scale=1.0,
     )
     assert Retrieval(exhaustive_below=3, neighbours=2)([*features[:5], empty])
+
+
+# several cameras on one drone
+
+
+def rig(cameras, apart=15.0, noise=0.0, seed=0):
+    """Names of cameras (n,) and positions (n, 2) of a drone that carries them over 4 x 5 places."""
+    rng = np.random.default_rng(seed)
+    at = [(apart * x, 1.5 * apart * y) for y in range(4) for x in range(5)]
+    names = [f"c{k}" for _ in at for k in range(cameras)]
+    return names, np.repeat(at, cameras, 0) + rng.normal(0, noise, (len(names), 2))
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.5])
+@pytest.mark.parametrize("cameras", [2, 5])
+def test_photos_of_each_camera_on_a_drone_are_paired(cameras, noise):
+    names, xy = rig(cameras, noise=noise, seed=cameras)
+    places = by_camera(names, xy)
+    own = Nearest(neighbours=8)(places)
+    for name in set(names):
+        mine = [k for k, n in enumerate(names) if n == name]
+        expected = {(mine[i], mine[j]) for i, j in Nearest(neighbours=8)(xy[mine])}
+        assert expected <= set(own)
+    assert all(names[i] == names[j] for i, j in own)
+
+
+def test_other_drones_are_no_cameras_of_one():
+    names, xy = rig(1)
+    assert by_camera(names, xy) is None
+    beside = xy + [0, 0.75 * 15]  # another drone's lines between those of the first
+    assert by_camera([*names, *["d"] * len(xy)], np.vstack([xy, beside])) is None
+    away = xy + [400.0, 0]
+    assert by_camera([*names, *["d"] * len(xy)], np.vstack([xy, away])) is None
+    assert by_camera(["a", "b"], np.full((2, 2), np.nan)) is None
+    assert by_camera([], np.zeros((0, 2))) is None
+    assert by_camera(["a", "b"], np.zeros((2, 2))) is None
+
+
+def test_photos_without_position_stay_without():
+    names, xy = rig(3)
+    xy[4] = np.nan
+    places = by_camera(names, xy)
+    assert np.isnan(places[4, :2]).all() and np.isfinite(np.delete(places, 4, 0)).all()
+    assert all(4 not in pair for pair in Nearest()(places))

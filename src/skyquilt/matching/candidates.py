@@ -11,6 +11,8 @@ from skyquilt.geometry.neighbours import nearest
 from skyquilt.model.features import Features
 
 Pair = tuple[int, int]
+FAR_M = 1e5
+"""Distance in m at which photos of two cameras count that are not to be paired."""
 MOST_SAMPLED = 100_000
 """Descriptors from which a vocabulary is learnt, about; those of all photos may fill the memory."""
 
@@ -30,7 +32,8 @@ class Nearest:
 
     def __call__(self, map_xy: NDArray[Any], reach_m: float | None = None) -> list[Pair]:
         """Pairs i < j of photos with positions (n, 2) in m (NaN where unknown), nearest first; or
-        with places (n, 4) that tell oblique views, too (`alignment.oblique.looked_at`).
+        with places (n, 3 or 4) that tell the camera or the view, too (`by_camera`,
+        `alignment.oblique.looked_at`).
         """
         known = np.flatnonzero(np.isfinite(map_xy).all(1))
         if len(known) < 2:
@@ -45,6 +48,27 @@ class Nearest:
                     i, k = sorted((int(known[row]), int(known[j])))
                     found[i, k] = float(d)
         return sorted(found, key=lambda pair: (found[pair], pair))
+
+
+def by_camera(cameras: Sequence[str], map_xy: NDArray[Any]) -> NDArray[np.float64] | None:
+    """Places (n, 3) by which photos are near to those of their own camera only, where several
+    cameras are carried by one drone: most photos lie beside one of another camera, nearer than half
+    way to the next of their own. None otherwise.
+
+    Where such cameras look to different sides, photos of one place have nothing in common.
+    `cameras`: name of each photo's; positions (n, 2) in m, NaN where unknown.
+    """
+    names, number = np.unique(np.asarray(cameras), return_inverse=True)
+    known = np.isfinite(map_xy).all(1)
+    beside = 0
+    for k in range(len(names)):
+        own, others = map_xy[known & (number == k)], map_xy[known & (number != k)]
+        if len(own) > 1 and len(others):
+            next_own = nearest(own, own, 2)[0][:, 1]
+            beside += int((nearest(others, own, 1)[0][:, 0] < next_own / 2).sum())
+    if 2 * beside <= known.sum() or not beside:
+        return None
+    return np.column_stack([map_xy, FAR_M * number])
 
 
 def sequence(count: int, step: int = 1) -> list[Pair]:

@@ -18,7 +18,7 @@ from skyquilt.engine.workers import Workers
 from skyquilt.geometry.set_aside import InFile
 from skyquilt.imaging.nodes import View, project_nodes
 from skyquilt.imaging.views import make_views, on_ground
-from skyquilt.matching.candidates import Pair, sequence
+from skyquilt.matching.candidates import Pair, by_camera, sequence
 from skyquilt.matching.fixed_marks import FindFixedMarks, FixedMarks
 from skyquilt.matching.lens_kind import fisheye_note, fisheyes, may_be_fisheye
 from skyquilt.matching.matchers import Guided
@@ -202,7 +202,7 @@ class _Linker:
         methods: Methods,
         store: Store,
     ) -> None:
-        self.found, self.frame, self.methods, self.store = found, frame, methods, store
+        self.found, self.methods, self.store = found, methods, store
         self.features = found.features
         self.marks = marks_of(found.photos, found.features)
         self.expected: ExpectedPlaces | None = None
@@ -210,6 +210,13 @@ class _Linker:
             height = methods.matcher.height_m
             self.expected = ExpectedPlaces(found.photos, frame, priors, height)
         by = None if self.expected is None else self.expected.key
+        cameras, xy = [p.camera_key for p in found.photos], np.array([p.map_C[:2] for p in priors])
+        self.views = looked_at(priors, ground_of(frame))
+        """Places by which photos with like views are near to one another; None where positions
+        alone tell which photos may show the same.
+        """
+        if self.views is None:
+            self.views = by_camera(cameras, xy.reshape(-1, 2))
         self._recipe = digest(
             features_recipe(methods.detector), methods.matcher, methods.verify, by, self.marks
         )
@@ -240,9 +247,8 @@ class _Linker:
         photos = [(seen_as(p), p.width, p.height) for p in self.found.photos]
         methods = self.methods.nearest, self.methods.retrieval, link_photos
         places = [p.map_C[:2].tolist() for p in priors]
-        views = looked_at(priors, ground_of(self.frame))
-        if views is not None:
-            places = views.tolist()
+        if self.views is not None:
+            places = self.views.tolist()
         return digest(photos, places, self._recipe, *methods)
 
 
@@ -342,7 +348,7 @@ def _linked(
     n = len(found.photos)
     xy = np.array([p.map_C[:2] for p in priors]).reshape(-1, 2)
     lost = [i for i in range(n) if not np.isfinite(xy[i]).all()]
-    nearest = _near(methods, xy, looked_at(priors, ground_of(linker.frame)))
+    nearest = _near(methods, xy, linker.views)
     # in order of capture, so that the features of a photo are read once for all its pairs
     first = sorted({*sequence(n), *_closest(nearest(None), n, 2)})
     tried: list[Link | RejectedLink] = []
@@ -365,7 +371,7 @@ def _near(
     methods: Methods, xy: NDArray[np.float64], views: NDArray[np.float64] | None
 ) -> Callable[[float | None], list[Pair]]:
     """Pairs, nearest first, of photos that lie within a reach in m (None: any) by their positions
-    (n, 2), or by what oblique ones look at (n, 4).
+    (n, 2), or by their views (`_Linker.views`).
     """
 
     def nearest(reach_m: float | None) -> list[Pair]:
