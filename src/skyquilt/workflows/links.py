@@ -210,7 +210,9 @@ class _Linker:
             height = methods.matcher.height_m
             self.expected = ExpectedPlaces(found.photos, frame, priors, height)
         by = None if self.expected is None else self.expected.key
-        cameras, xy = [p.camera_key for p in found.photos], np.array([p.map_C[:2] for p in priors])
+        # cameras that tell no number of theirs have a folder each
+        cameras = [f"{p.camera_key} {p.path.parent}" for p in found.photos]
+        xy = np.array([p.map_C[:2] for p in priors])
         self.views = looked_at(priors, ground_of(frame))
         """Places by which photos with like views are near to one another; None where positions
         alone tell which photos may show the same.
