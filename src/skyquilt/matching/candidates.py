@@ -50,6 +50,19 @@ class Nearest:
         return sorted(found, key=lambda pair: (found[pair], pair))
 
 
+def closest(pairs: Sequence[Pair], count: int, each: int) -> list[Pair]:
+    """From pairs sorted by distance, those that are among the `each` closest pairs of one of their
+    photos.
+    """
+    degree = np.zeros(count, int)
+    kept = []
+    for i, j in pairs:
+        if degree[i] < each or degree[j] < each:
+            kept.append((i, j))
+            degree[[i, j]] += 1
+    return kept
+
+
 def by_camera(cameras: Sequence[str], map_xy: NDArray[Any]) -> NDArray[np.float64] | None:
     """Places (n, 3) by which photos are near to those of their own camera only, where several
     cameras are carried by one drone: most photos lie beside one of another camera, nearer than half

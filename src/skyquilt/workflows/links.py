@@ -18,7 +18,7 @@ from skyquilt.engine.workers import Workers
 from skyquilt.geometry.set_aside import InFile
 from skyquilt.imaging.nodes import View, project_nodes
 from skyquilt.imaging.views import make_views, on_ground
-from skyquilt.matching.candidates import Pair, by_camera, sequence
+from skyquilt.matching.candidates import Pair, by_camera, closest, sequence
 from skyquilt.matching.fixed_marks import FindFixedMarks, FixedMarks
 from skyquilt.matching.lens_kind import fisheye_note, fisheyes, may_be_fisheye
 from skyquilt.matching.matchers import Guided
@@ -352,7 +352,7 @@ def _linked(
     lost = [i for i in range(n) if not np.isfinite(xy[i]).all()]
     nearest = _near(methods, xy, linker.views)
     # in order of capture, so that the features of a photo are read once for all its pairs
-    first = sorted({*sequence(n), *_closest(nearest(None), n, 2)})
+    first = sorted({*sequence(n), *closest(nearest(None), n, 2)})
     tried: list[Link | RejectedLink] = []
     for batch in workers.each(matched, _batches(first)):
         tried += batch
@@ -381,19 +381,6 @@ def _near(
         return pairs if views is None else [*methods.nearest(views, reach_m), *pairs]
 
     return nearest
-
-
-def _closest(pairs: Sequence[Pair], count: int, each: int) -> list[Pair]:
-    """From pairs sorted by distance, those that are among the `each` closest pairs of one of their
-    photos.
-    """
-    degree = np.zeros(count, int)
-    kept = []
-    for i, j in pairs:
-        if degree[i] < each or degree[j] < each:
-            kept.append((i, j))
-            degree[[i, j]] += 1
-    return kept
 
 
 def overlap_reach_m(
