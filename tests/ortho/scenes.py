@@ -12,7 +12,7 @@ from skyquilt.geometry.frames import cam_R_map_from_angles
 from skyquilt.imaging.nodes import View
 from skyquilt.imaging.views import footprint
 from skyquilt.model.camera import Camera
-from skyquilt.model.poses import Pose
+from skyquilt.model.poses import Alignment, MapFrame, Pose
 from skyquilt.model.raster import Grid
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.blend import Feather
@@ -33,6 +33,20 @@ GROUND = np.clip(texture(3200, 3200, seed=11, roughness=1.2), 5, 250).astype(np.
 def view(number, x, y, *, z=40.0, yaw=0.0, pitch=0.0, roll=0.0, camera=CAMERA, surface=FLAT):
     pose = Pose(cam_R_map=cam_R_map_from_angles(yaw, pitch, roll), map_C=np.array([x, y, z]))
     return View(photo=number, camera=camera, pose=pose, footprint=footprint(camera, pose, surface))
+
+
+def placed(poses, ties):
+    """A block of photos by one camera, in a frame of its own."""
+    return Alignment(
+        method="bundle",
+        why="",
+        frame=MapFrame(crs=None, origin=(0.0, 0.0), vertical_datum="unknown"),
+        poses=poses,
+        cameras={"one": CAMERA},
+        camera_of=dict.fromkeys(poses, "one"),
+        blocks=(tuple(poses),),
+        ties=ties,
+    )
 
 
 def ground_of(shot, px):

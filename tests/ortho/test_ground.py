@@ -8,13 +8,13 @@ import pytest
 from skyquilt.engine.clock import result_of
 from skyquilt.engine.store import Store
 from skyquilt.geometry.frames import cam_R_map_from_angles
-from skyquilt.model.poses import Alignment, MapFrame, Pose, no_ties
+from skyquilt.model.poses import Pose, no_ties
 from skyquilt.model.raster import Grid
 from skyquilt.ortho.ground import ALIGNED, find_ground
 from skyquilt.ortho.tie_surface import FromTiePoints, level
 from skyquilt.settings import PictureSettings
 from skyquilt.workflows.artefacts import REGISTRY
-from tests.ortho.scenes import CAMERA
+from tests.ortho.scenes import CAMERA, placed
 
 HEIGHT_M = 40.0
 XYZ = np.array([[x, y, 0.0] for x in (-20.0, 0.0, 20.0) for y in (-15.0, 15.0)])
@@ -37,16 +37,7 @@ def alignment():
         k: Pose(cam_R_map=cam_R_map_from_angles(0, 0, 0), map_C=np.array([x, 0.0, HEIGHT_M]))
         for k, x in enumerate((-10.0, 10.0))
     }
-    return Alignment(
-        method="bundle",
-        why="",
-        frame=MapFrame(crs=None, origin=(0.0, 0.0), vertical_datum="unknown"),
-        poses=poses,
-        cameras={"one": CAMERA},
-        camera_of=dict.fromkeys(poses, "one"),
-        blocks=((0, 1),),
-        ties=replace(no_ties(), xyz=XYZ),
-    )
+    return placed(poses, replace(no_ties(), xyz=XYZ))
 
 
 @pytest.mark.parametrize("low_m", [-20.0, 0.0, 8.0])

@@ -13,14 +13,14 @@ import rasterio
 
 from skyquilt.geometry.frames import cam_R_map_from_angles
 from skyquilt.imaging.grey import DETAIL_CELLS, detail
-from skyquilt.model.poses import Alignment, MapFrame, Pose, TiePoints, no_ties
+from skyquilt.model.poses import Pose, TiePoints, no_ties
 from skyquilt.ortho.sharpness import find_blurred
 from skyquilt.settings import MosaicSettings
 from skyquilt.simulate import preset, simulate
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Pictures, Route
 from skyquilt.workflows.mosaic import mosaic
-from tests.ortho.scenes import CAMERA, photograph, view
+from tests.ortho.scenes import photograph, placed, view
 
 ROWS, COLUMNS = DETAIL_CELLS
 
@@ -43,16 +43,7 @@ def flight(count, apart=9.0, across=12.0, *, ties=True, seed=0):
         xyz = np.column_stack([x.ravel(), y.ravel(), 0 * x.ravel()])
         points = TiePoints(xyz=xyz, point=points.point, photo=points.photo, px=points.px,
                            residual_px=points.residual_px)  # fmt: skip
-    return Alignment(
-        method="bundle",
-        why="",
-        frame=MapFrame(crs=None, origin=(0.0, 0.0), vertical_datum="unknown"),
-        poses=poses,
-        cameras={"one": CAMERA},
-        camera_of=dict.fromkeys(poses, "one"),
-        blocks=(tuple(poses),),
-        ties=points,
-    )
+    return placed(poses, points)
 
 
 def seen(alignment, seed=1):

@@ -103,12 +103,12 @@ def find_spots(
     """Dark spots at the same place of all pictures of a camera, by photo (index), and notes.
     `thumbnails`: (h, w[, bands]) of the photos; only those of 8 bits are judged.
     """
-    photos = [i for i in sorted(alignment.poses) if thumbnails[i].dtype == np.uint8]
+    photos = {i for i in alignment.poses if thumbnails[i].dtype == np.uint8}
     if len(photos) < FEWEST_SPOILT:
         return {}, ()
     xyz = alignment.ties.xyz
     flat = level(float(np.median(xyz[:, 2])) if len(xyz) else 0.0)
-    views = [v for v in make_views(alignment, flat) if v.photo in set(photos)]
+    views = [v for v in make_views(alignment, flat) if v.photo in photos]
     if not views:
         return {}, ()
     outline = np.concatenate([v.footprint for v in views])

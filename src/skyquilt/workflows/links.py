@@ -1,6 +1,6 @@
 """Finds photos that show the same ground: candidate pairs, matches, verified links."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby, pairwise
 from typing import Any
@@ -210,18 +210,27 @@ class _Linker:
             height = methods.matcher.height_m
             self.expected = ExpectedPlaces(found.photos, frame, priors, height)
         by = None if self.expected is None else self.expected.key
-        # cameras that tell no number of theirs have a folder each
-        cameras = [f"{p.camera_key} {p.path.parent}" for p in found.photos]
-        xy = np.array([p.map_C[:2] for p in priors])
+        self.xy = np.array([p.map_C[:2] for p in priors]).reshape(-1, 2)
+        """Positions (n, 2) in m; NaN where unknown."""
         self.views = looked_at(priors, ground_of(frame))
         """Places by which photos with like views are near to one another; None where positions
         alone tell which photos may show the same.
         """
-        if self.views is None:
-            self.views = by_camera(cameras, xy.reshape(-1, 2))
+        if self.views is None:  # cameras that tell no number of theirs have a folder each
+            cameras = [f"{p.camera_key} {p.path.parent}" for p in found.photos]
+            self.views = by_camera(cameras, self.xy)
         self._recipe = digest(
             features_recipe(methods.detector), methods.matcher, methods.verify, by, self.marks
         )
+
+    def nearest(self, reach_m: float | None = None) -> list[Pair]:
+        """Pairs, nearest first, of photos within a reach in m (None: any) by their views, then of
+        those within it by their positions.
+        """
+        pairs = self.methods.nearest(self.xy, reach_m)
+        if self.views is None:
+            return pairs
+        return [*self.methods.nearest(self.views, reach_m), *pairs]
 
     def one(self, pair: Pair) -> Link | RejectedLink:
         a, b = pair
@@ -244,14 +253,12 @@ class _Linker:
         )
         return [replace(k, a=i, b=j) for k, (i, j) in zip(kept, pairs, strict=True)]
 
-    def key(self, priors: Sequence[Prior]) -> str:
+    def key(self) -> str:
         """Key of all links of the survey."""
         photos = [(seen_as(p), p.width, p.height) for p in self.found.photos]
         methods = self.methods.nearest, self.methods.retrieval, link_photos
-        places = [p.map_C[:2].tolist() for p in priors]
-        if self.views is not None:
-            places = self.views.tolist()
-        return digest(photos, places, self._recipe, *methods)
+        places = self.xy if self.views is None else np.column_stack([self.xy, self.views])
+        return digest(photos, places.tolist(), self._recipe, *methods)
 
 
 def seen_as(photo: Photo) -> object:
@@ -308,10 +315,10 @@ def link_photos(
     links are kept as one artefact too, so that a run that goes on has them at once.
     """
     linker = _Linker(found, frame, priors, methods, store)
-    key = linker.key(priors)
+    key = linker.key()
     packed: PackedLinks | None = store.get("links", key)
     if packed is None:
-        packed = PackedLinks.of((yield from _linked(linker, priors, workers)))
+        packed = PackedLinks.of((yield from _linked(linker, workers)))
         store.put("links", key, packed)
     matches = packed.in_files()
     tried = list(replace(packed, index_a=matches[0].values, index_b=matches[1].values))
@@ -342,23 +349,19 @@ def marked_in(
     return a, b
 
 
-def _linked(
-    linker: _Linker, priors: Sequence[Prior], workers: Workers
-) -> Steps[list[Link | RejectedLink]]:
+def _linked(linker: _Linker, workers: Workers) -> Steps[list[Link | RejectedLink]]:
     """Tries all pairs."""
     found, methods, matched = linker.found, linker.methods, linker.batch
-    n = len(found.photos)
-    xy = np.array([p.map_C[:2] for p in priors]).reshape(-1, 2)
+    n, xy = len(found.photos), linker.xy
     lost = [i for i in range(n) if not np.isfinite(xy[i]).all()]
-    nearest = _near(methods, xy, linker.views)
     # in order of capture, so that the features of a photo are read once for all its pairs
-    first = sorted({*sequence(n), *closest(nearest(None), n, 2)})
+    first = sorted({*sequence(n), *closest(linker.nearest(), n, 2)})
     tried: list[Link | RejectedLink] = []
     for batch in workers.each(matched, _batches(first)):
         tried += batch
         yield len(tried), 2 * len(first)
     reach = overlap_reach_m([k for k in tried if isinstance(k, Link)], found, xy)
-    rest = nearest(reach) if n > 2 else []
+    rest = linker.nearest(reach) if n > 2 else []
     if lost and n > 2:
         rest += methods.retrieval(found.features, None if len(lost) == n else lost)
     done = set(first)
@@ -367,20 +370,6 @@ def _linked(
         tried += batch
         yield len(tried), len(first) + len(rest)
     return tried
-
-
-def _near(
-    methods: Methods, xy: NDArray[np.float64], views: NDArray[np.float64] | None
-) -> Callable[[float | None], list[Pair]]:
-    """Pairs, nearest first, of photos that lie within a reach in m (None: any) by their positions
-    (n, 2), or by their views (`_Linker.views`).
-    """
-
-    def nearest(reach_m: float | None) -> list[Pair]:
-        pairs = methods.nearest(xy, reach_m)
-        return pairs if views is None else [*methods.nearest(views, reach_m), *pairs]
-
-    return nearest
 
 
 def overlap_reach_m(
