@@ -1,4 +1,6 @@
-"""Candidate pairs: neighbours by position, neighbours in time, and photos of similar content."""
+"""Candidate pairs: neighbours by position (and by view or camera), neighbours in time, and photos
+of similar content.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
