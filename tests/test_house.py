@@ -191,8 +191,12 @@ def test_what_the_documents_name_is_there():
 
     lost = []
     packages = {p.name for p in (ROOT / "src" / "skyquilt").iterdir() if p.is_dir()}
-    for page in ("methods", "architecture", "spectral", "estimators", "conventions", "decisions"):
-        text = (ROOT / "docs" / f"{page}.md").read_text()
+    names = ("methods", "architecture", "spectral", "estimators", "conventions")
+    pages = [ROOT / "docs" / f"{name}.md" for name in names]
+    decisions = sorted((ROOT / "docs" / "decisions").glob("*.md"))
+    assert len(decisions) > 5
+    for page in (*pages, *decisions):
+        text = page.read_text()
         for name in re.findall(r"`((?:\w+\.)+\w+)(?:\(\))?`", text):
             parts = name.split(".")
             if parts[0] not in packages or name.endswith((".py", ".csv", ".html")):
@@ -207,7 +211,7 @@ def test_what_the_documents_name_is_there():
                     except AttributeError:
                         found = import_module("skyquilt." + ".".join(parts[:k]))
             except ImportError:
-                lost.append(f"{page}: {name}")
+                lost.append(f"{page.name}: {name}")
     assert lost == []
 
 

@@ -1,10 +1,10 @@
 """Bundle adjustment: Levenberg-Marquardt on the Schur complement, with priors on all unknowns for
 which one is known.
 
-Robust losses are iteratively reweighted (Cauchy). Why no library is used: see docs/decisions.md.
-The wheel of pycolmap offers priors on positions only; a flight strip without loops also needs
-priors on tilt and on every intrinsic. The tests compare this code with pycolmap's Ceres on problems
-that both can express.
+Robust losses are iteratively reweighted (Cauchy). Why no library is used: see
+docs/decisions/adjustment.md. The wheel of pycolmap offers priors on positions only; a flight strip
+without loops also needs priors on tilt and on every intrinsic. The tests compare this code with
+pycolmap's Ceres on problems that both can express.
 """
 
 from collections.abc import Callable, Sequence
