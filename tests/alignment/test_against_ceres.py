@@ -70,7 +70,7 @@ def test_the_pixel_convention_matters():
 
 @pytest.mark.skipif(find_spec("pyceres") is not None, reason="pyceres gives costs their type")
 def test_pycolmap_alone_cannot_state_a_prior_on_tilt():
-    """A reason for an adjuster of our own (docs/decisions/adjustment.md): once it fails, look again."""
+    """A reason for an adjuster of our own (decisions/adjustment.md): once it fails, look again."""
     pose = import_module("pycolmap").Rigid3d()
     costs = import_module("pycolmap.cost_functions")
     with pytest.raises(TypeError, match="ceres::CostFunction"):
