@@ -1,5 +1,5 @@
-"""What photos show badly, so that others are drawn in their place: marks, blur, spots, and what is
-overexposed.
+"""What photos show badly, so that others are drawn in their place: marks, blur, spots, veils, and
+what is overexposed.
 
 Dust on a lens or a sensor darkens the same place of every picture. What a photo shows there is
 darker than what others show of the same ground, and than what lies beside it in the picture.
@@ -19,6 +19,7 @@ from skyquilt.ortho.exposure import Balance, Samples
 from skyquilt.ortho.radiometry import InGrey
 from skyquilt.ortho.sharpness import FEWEST_SPOILT, LARGEST_SPOT, find_blurred
 from skyquilt.ortho.tie_surface import level
+from skyquilt.ortho.veiled import find_veiled
 from skyquilt.photos.side_rows import sentence_of
 
 WHITE = 250
@@ -68,9 +69,10 @@ def spoilt_parts(
     if white:
         notes += (overexposed_note([names[i] for i in white]),)
     spots, told = find_spots(alignment, thumbnails)
-    notes += told
+    veiled, seen = find_veiled(alignment, thumbnails, names, fixed)
+    notes += told + seen
     out = dict(fixed)
-    for found in (blurred, white, spots):
+    for found in (blurred, white, spots, veiled):
         out |= {i: joined(out[i], b) if i in out else b for i, b in found.items()}
     return out, notes
 
