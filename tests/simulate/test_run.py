@@ -153,7 +153,7 @@ def test_command_with_every_option(tmp_path):
     --size 240x180 --gps-noise 1 --gps-missing 1 --yaw-lie tag --altitude-drift 20 --focal-error 2
     --compass-error 12 --gimbal-error -1
     --tilt-noise 0.5 --relief 3 --season winter --hour 12 --exposure-noise 0.1 --motion-blur 2
-    --vignetting 30 --sun-hours 1
+    --vignetting 30 --sun-hours 1 --fires 2
     --no-thermal --drones 2 --lose 1 --gcp 2 --checks 1 --seed 4"""
     result = CliRunner().invoke(app, ["simulate", str(tmp_path / "out"), *words.split()])
     assert result.exit_code == 0, result.output

@@ -156,6 +156,9 @@ def command(
     blurred: Annotated[
         float | None, typer.Option(help="photos blurred one by one, percent")
     ] = None,
+    fires: Annotated[
+        int | None, typer.Option(help="fires on the site, whose smoke drifts over it")
+    ] = None,
     lose: Annotated[int | None, typer.Option(help="photos lost on the way")] = None,
     oblique: Annotated[
         int | None,
@@ -217,6 +220,7 @@ def command(
         vignetting=_share(vignetting),
         sun_hours=sun_hours,
         motion_blur=motion_blur,
+        fires=fires,
     )
     base = _with(base, "control", points=gcp, checks=checks)
     base = _thermal(

@@ -23,7 +23,7 @@ from skyquilt.photos.side_rows import sentence_of
 
 Float = NDArray[np.float32]
 _Look = tuple[NDArray[np.int32], NDArray[np.int16], Float]
-"""Ground points that a photo shows, the cells of its picture in which they lie, and its contrast."""
+"""Ground points that a photo shows, the cells of its picture with them, and its contrast there."""
 
 FINE, WINDOW = 5, 13
 """Sides in px of a reduced picture: of what fine contrast is told from, and of windows over which
@@ -40,7 +40,7 @@ longer side.
 FEWEST_VIEWS = 3
 """Fewest photos that must show a place; the second clearest of them tells what it looks like."""
 TIED, NEAR = 3, 7
-"""So many tie points must lie within so many ground points' squares: waves and glitter have none."""
+"""So many tie points must lie within so many squares a side: waves and glitter have none."""
 SURELY, SURE_SHARE = 0.5, 0.04
 """There are veils where a part of a picture, at least such a share of it, lies so far below others
 in the logarithm of contrast, even where these show least around: a tree or a roof that leans over
@@ -66,30 +66,45 @@ def find_veiled(
     of the photos; `fixed`: where they show marks.
     """
     xyz = alignment.ties.xyz
-    photos = {i for i in alignment.poses if thumbnails[i].dtype == np.uint8}
-    if len(photos) < FEWEST_VIEWS or not len(xyz):
+    if not len(xyz):
         return {}, ()
-    flat = level(float(np.median(xyz[:, 2])))
-    views = [v for v in make_views(alignment, flat) if v.photo in photos]
-    if not views:
-        return {}, ()
+    views = make_views(alignment, level(float(np.median(xyz[:, 2]))))
+    found = veiled_parts(views, xyz, thumbnails, fixed)
+    return found, ((veiled_note([names[i] for i in found]),) if found else ())
+
+
+def veiled_note(names: Sequence[str]) -> str:
+    """A note about photos of these names, at least one."""
+    some = f"{len(names)} photos show" if len(names) > 1 else "One photo shows"
+    return (
+        f"{some} a part of the ground through smoke, fog or haze, or with far less contrast than"
+        f" others ({sentence_of(names)}). That part is drawn only where no other photo shows the"
+        " ground."
+    )
+
+
+def veiled_parts(
+    views: Sequence[View],
+    xyz: NDArray[Any],
+    thumbnails: Mapping[int, NDArray[Any]],
+    fixed: Mapping[int, Blank],
+) -> dict[int, Blank]:
+    """What is veiled in photos as seen from some views, by photo, only of photos where something
+    is; `xyz`: tie points (n, 3) on their ground, at least one.
+    """
+    views = [v for v in views if thumbnails[v.photo].dtype == np.uint8]
+    if len(views) < FEWEST_VIEWS:
+        return {}
     seen = _Ground(views, xyz)
     looks = [seen.look(view, thumbnails[view.photo], fixed.get(view.photo)) for view in views]
     least = seen.least()
     if not any(_large(b > SURELY, SURE_SHARE).any() for b in _below(views, looks, least)):
-        return {}, ()
+        return {}
     found = dict[int, Blank]()
     for view, below in zip(views, _below(views, looks, seen.clearest()), strict=True):
         if (veil := veiled_part(below)) is not None:
             found[view.photo] = Blank(room=veil, size=(view.camera.width, view.camera.height))
-    if not found:
-        return {}, ()
-    some = f"{len(found)} photos show" if len(found) > 1 else "One photo shows"
-    return found, (
-        f"{some} a part of the ground through smoke, fog or haze, or with far less contrast than"
-        f" others ({sentence_of([names[i] for i in found])}). That part is drawn only where no other"
-        " photo shows the ground.",
-    )
+    return found
 
 
 def fine_contrast(thumbnail: NDArray[Any]) -> Float:
@@ -147,14 +162,19 @@ def _raster(cell: NDArray[Any], value: NDArray[Any], shape: tuple[int, int]) -> 
     few of these are known.
     """
     n = shape[0] * shape[1]
-    count = np.bincount(cell, minlength=n).reshape(shape).astype(np.float32)
-    total = np.bincount(cell, value, minlength=n).reshape(shape).astype(np.float32)
-    count, total = (cv2.blur(x, (3, 3), borderType=cv2.BORDER_CONSTANT) for x in (count, total))
+    count, total = (
+        cv2.blur(
+            np.bincount(cell, weight, n).reshape(shape).astype(np.float32),
+            (3, 3),
+            borderType=cv2.BORDER_CONSTANT,
+        )
+        for weight in (None, value)
+    )
     return np.where(count > KNOWN, total / np.maximum(count, KNOWN), 0).astype(np.float32)
 
 
 class _Ground:
-    """Points of level ground, and the fine contrast of the two photos that show each most clearly."""
+    """Points of level ground, and the contrast of the two photos that show each most clearly."""
 
     def __init__(self, views: Sequence[View], xyz: NDArray[Any]) -> None:
         outline = np.concatenate([v.footprint for v in views])
@@ -177,9 +197,7 @@ class _Ground:
         )
         self._tied = (near.ravel() * NEAR**2) > TIED - 0.5
 
-    def look(
-        self, view: View, thumbnail: NDArray[Any], mark: Blank | None
-    ) -> _Look:
+    def look(self, view: View, thumbnail: NDArray[Any], mark: Blank | None) -> _Look:
         """What a photo shows, without what shows nothing or a mark."""
         first = np.floor((view.footprint.min(0) - self._low) / self._step).astype(int)
         last = np.ceil((view.footprint.max(0) - self._low) / self._step).astype(int)

@@ -17,6 +17,7 @@ from skyquilt.simulate.horizon import with_horizon
 from skyquilt.simulate.raycast import FLATTEST, first_hits, rays_of, sample
 from skyquilt.simulate.scene import Scene
 from skyquilt.simulate.settings import Pictures
+from skyquilt.simulate.smoke import GREY, Smoke
 from skyquilt.simulate.weather import Weather
 
 _TEXTURE_PX = 1024
@@ -105,9 +106,10 @@ class Exposer:
         gain: float,
         rng: np.random.Generator,
         weather: Weather | None = None,
+        smoke: Smoke | None = None,
     ) -> NDArray[np.uint8]:
         """The visible image (h, w, 3) as the camera stores it; `weather`: another moment than that
-        of the scene.
+        of the scene; `smoke` that drifts over it.
         """
         hits, heights, window = self.pixels(shot)
         colours = (
@@ -121,6 +123,9 @@ class Exposer:
             place = hits * np.float32(window.res) + np.array([window.xs[0], -window.ys[0]])
             seen = with_waves(seen, place, heights <= self.scene.water + _WET_M, rng)
         seen = with_horizon(seen, self.scene, self.directions, shot)
+        if smoke is not None:
+            veil = smoke.veil(self.directions, shot)[..., None]
+            seen = seen * (1 - veil) + veil * GREY
         seen = _blurred(seen, settings)
         seen *= (np.float32(gain) * falloff(self.lens, settings.vignetting))[..., None]
         if settings.noise > 0:

@@ -18,6 +18,7 @@ from skyquilt.simulate.noise import Noise
 from skyquilt.simulate.reported import Place, Report, Start, place_at, report_all
 from skyquilt.simulate.scene import Country, Scene, empty_scene
 from skyquilt.simulate.settings import FlightSettings, Pictures, Thermal, Video
+from skyquilt.simulate.smoke import smoke_of
 from skyquilt.simulate.terrain import WATER_M, depth
 from skyquilt.simulate.truth import (
     Taken,
@@ -298,6 +299,7 @@ def photograph(
     taken = []
     shaken = np.random.default_rng([world.settings.seed, 54]).permutation(len(flight.shots))
     spoilt = set(shaken[: pictures.blurred].tolist())
+    smoke = smoke_of(pictures.fires, flight.shots, world.settings.seed)
     sharp, shake = pictures, replace(pictures, motion_blur=pictures.blurred_px)
     for number, (shot, report) in enumerate(zip(flight.shots, flight.reports, strict=True)):
         if number % share[1] != share[0]:
@@ -307,7 +309,7 @@ def photograph(
         gain = float(np.exp(rng.normal(0, pictures.exposure_noise)))
         name = f"{shot.name}.jpg"
         if not (resume and (folder / name).exists()):
-            pixels = camera.visible(shot, pictures, gain, rng, _moment(world, shot))
+            pixels = camera.visible(shot, pictures, gain, rng, _moment(world, shot), smoke)
             if report.turned:
                 pixels = np.ascontiguousarray(pixels[::-1, ::-1])
             body = Body(

@@ -94,6 +94,8 @@ class Pictures:
     """Standard deviation of the lens's blur, px."""
     motion_blur: float = 0.0
     """Length of the blur along the flight, px."""
+    fires: int = 0
+    """Fires on the site, whose smoke drifts over it."""
     blurred: int = 0
     """Photos spoilt one by one, by a shake of the camera."""
     blurred_px: float = 16.0
@@ -387,6 +389,7 @@ def _other_rules(settings: FlightSettings) -> _Rules:
             0 <= pictures.blurred <= settings.route.photos,
             f"at most all {settings.route.photos} photos can be blurred, not {pictures.blurred}",
         ),
+        (0 <= pictures.fires <= 100, f"there can be 0 to 100 fires, not {pictures.fires}"),
         (0 <= settings.route.wind <= 40, "wind must be 0 to 40 m/s"),
         (0 <= pictures.motion_blur <= 100, "motion blur must be 0 to 100 px"),
         (
