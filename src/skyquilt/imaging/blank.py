@@ -103,6 +103,11 @@ def around(mask: Mask, size: tuple[int, int]) -> Blank:
     return Blank(room=_room(mask), size=size)
 
 
+def whole_picture(size: tuple[int, int]) -> Blank:
+    """All of a photo of a `size`, width and height in px."""
+    return Blank(room=np.full((2, 2), -1, np.float32), size=size)
+
+
 def joined(a: Blank, b: Blank) -> Blank:
     """Parts of a photo that are in either."""
     if a.room.size < b.room.size:

@@ -8,6 +8,7 @@ links, however large the map is.
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.imaging.blank import Blank, whole_picture
 from skyquilt.live.doubled import tell_doubled
 from skyquilt.live.links import LiveLinks
 from skyquilt.live.members import Member
@@ -37,6 +38,11 @@ class LiveBlur:
         known = (whole(v, 1, MOST) for v in (said if isinstance(said, list) else []))
         self.blurred = {v for v in known if v is not None}
         self._pairs: dict[tuple[int, int], NDArray[np.float64] | None] = {}
+
+    def of(self, number: int) -> Blank | None:
+        """All of a photo if it is blurred."""
+        photo = self.members.by_id[number].photo
+        return whole_picture((photo.width, photo.height)) if number in self.blurred else None
 
     def look(self, member: Member) -> list[Member]:
         """Judges a photo that has new links, and those that it is linked with; returns those whose

@@ -44,6 +44,7 @@ from skyquilt.live.redraw_queue import RedrawQueue
 from skyquilt.live.refinement import Refinement
 from skyquilt.live.settings import LiveSettings
 from skyquilt.live.tile_drawing import Canvas
+from skyquilt.live.veils import LiveVeils
 from skyquilt.model import features, poses
 from skyquilt.ortho.height_cells import HeightCells
 from skyquilt.photos.pixels import read_color
@@ -141,6 +142,7 @@ class LiveMap:
         neighbours = Neighbours(self.members, metadata)
         self.live_links = LiveLinks(self.members, self.methods, self.store, self.full)
         blur = LiveBlur(self.live_links)
+        veils = LiveVeils(self.live_links, self.heights)
         local_pose = LocalPose(self.members, metadata, neighbours, self.live_links, self.settings)
         self.canvas = Canvas(
             self.tiles,
@@ -150,7 +152,7 @@ class LiveMap:
             self.store,
             self.settings.max_view_angle,
             self.live_links.marks.shown,
-            blur.blurred,
+            (blur.of, veils.of),
         )
         self.canvas.gsd = float(self.ledger.meta("gsd", 0.0))
         self.canvas.ground = float(self.ledger.meta("ground", 0.0))
@@ -158,7 +160,7 @@ class LiveMap:
         self.redraw = RedrawQueue(self.members, self.canvas, map_events)
         self.initial_pose = InitialPose(metadata, self.full, self.redraw, map_events, self.queues)
         self.refinement = Refinement(
-            local_pose, self.redraw, map_events, self.queues, self.schedule, blur
+            local_pose, self.redraw, map_events, self.queues, self.schedule, blur, veils
         )
         self.apply_adjustment = ApplyAdjustment(self.refinement)
         self.placeless = Placeless(initial_pose=self.initial_pose, refinement=self.refinement)

@@ -15,6 +15,7 @@ from skyquilt.live.local_pose import Change, LocalPose
 from skyquilt.live.members import Member, Queues, about_record
 from skyquilt.live.redraw_queue import RedrawQueue
 from skyquilt.live.thermal_notes import ThermalNotes
+from skyquilt.live.veils import LiveVeils
 from skyquilt.model.poses import Pose
 
 LOOP = 12
@@ -42,11 +43,13 @@ class Refinement:
         queues: Queues,
         schedule: Schedule,
         blur: LiveBlur,
+        veils: LiveVeils,
     ) -> None:
         self.local_pose, self.redraw, self.map_events = local_pose, redraw, map_events
         self.queues, self.schedule = queues, schedule
         self.members, self.ledger = local_pose.members, local_pose.members.ledger
-        self.blur, self.thermal_notes = blur, ThermalNotes(blur.live_links)
+        self.blur, self.veils = blur, veils
+        self.thermal_notes = ThermalNotes(blur.live_links)
         self._tried = max((m.tried for m in self.members.by_id.values()), default=0)
 
     def refine(self, member: Member) -> Update:
@@ -91,10 +94,10 @@ class Refinement:
                 self._again(lost)
             self.schedule.write(self.ledger)
             self.map_events.photo(member, reason=why)
-            blurred = self.blur.look(member)
+            altered = {m.id: m for m in (*self.blur.look(member), *self.veils.look(member))}
             self.thermal_notes.look(member)
         hit("photo refined")
-        for other in blurred:
+        for other in altered.values():
             self.redraw.altered(other)
         self.local_pose.neighbours.indexed(member)
 

@@ -129,10 +129,10 @@ class Canvas:
         store: Store,
         max_view_angle: float,
         marks: Callable[[str], Blank | None],
-        blurred: Collection[int],
+        badly: Sequence[Callable[[int], Blank | None]],
     ) -> None:
         """`marks`: what the photos of a camera (its key) all show at one place of the picture;
-        `blurred`: photos that are blurred, now and later.
+        `badly`: what a photo (its number) shows badly, such as all of a blurred one.
         """
         self.tiles, self.heights, self.members = tiles, heights, members
         self.gsd = 0.0
@@ -148,7 +148,7 @@ class Canvas:
         self._by_tile: dict[Address, set[int]] = defaultdict(set)
         self._pictures = SmallPictures(full, members, store)
         self._white: dict[int, Blank | None] = {}
-        self._marks, self._blurred = marks, blurred
+        self._marks, self._badly = marks, badly
         self._marked: dict[str, Blank | None] = {}
         self._tone = Tone(self._pictures)
 
@@ -222,10 +222,8 @@ class Canvas:
         self._sizes[member.id] = abs(z - self.ground) / camera.focal
         limits = self._limits(small, pose, surface)
         fixed = self._marks(member.photo.camera_key)
-        bad = [replace(fixed, size=(w, h))] if fixed is not None else []
-        bad += [white] if (white := self._overexposed(member, (w, h))) is not None else []
-        if member.id in self._blurred:
-            bad.append(Blank(room=np.full((2, 2), -1, np.float32), size=(w, h)))
+        parts = [fixed, self._overexposed(member, (w, h)), *(of(member.id) for of in self._badly)]
+        bad = [replace(part, size=(w, h)) for part in parts if part is not None]
         if bad:
             limits = replace(limits, mark=reduce(joined, bad))
         outline = footprint(small, pose, surface, limits=limits)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from skyquilt.geometry.camera import rays
 from skyquilt.geometry.neighbours import nearest
-from skyquilt.imaging.blank import Blank
+from skyquilt.imaging.blank import Blank, whole_picture
 from skyquilt.imaging.nodes import View
 from skyquilt.imaging.views import on_ground
 from skyquilt.model.poses import Alignment
@@ -84,9 +84,7 @@ def find_blurred(
         size = camera.width, camera.height
         below = (each[own] - np.median(each[own], 0))[:, :2].min(1)
         blurred = own[below < -BLURRED]
-        found |= {
-            photos[k]: Blank(room=np.full((2, 2), -1, np.float32), size=size) for k in blurred
-        }
+        found |= {photos[k]: whole_picture(size) for k in blurred}
         if len(blurred):
             notes.append(blurred_note([names[photos[k]] for k in blurred]))
         sharp = np.setdiff1d(own, blurred)

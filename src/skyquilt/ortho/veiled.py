@@ -37,14 +37,17 @@ SIDE, CELLS = 28, 32
 """Ground points along a side of a photo of the usual size, and cells of the picture along its
 longer side.
 """
+ALIKE = 1.3
+"""Largest quotient of the ground sizes of photos that are compared."""
 FEWEST_VIEWS = 3
 """Fewest photos that must show a place; the second clearest of them tells what it looks like."""
 TIED, NEAR = 3, 7
 """So many tie points must lie within so many squares a side: waves and glitter have none."""
-SURELY, SURE_SHARE = 0.5, 0.04
+SURELY, SURE_SHARE = 0.5, 0.06
 """There are veils where a part of a picture, at least such a share of it, lies so far below others
 in the logarithm of contrast, even where these show least around: a tree or a roof that leans over
-the ground in other photos has contrast, too, but not everywhere.
+the ground in other photos has contrast, too, but not everywhere. Shares of clear photos reach 0.025
+(12 surveys); the largest of five flights over fires are 0.12 to 0.29.
 """
 VEILED, SHARE, PARTLY = 0.4, 0.02, 0.2
 """Then a part is veiled where it lies so far below, on such a share of the picture, and goes on
@@ -70,7 +73,7 @@ def find_veiled(
         return {}, ()
     views = make_views(alignment, level(float(np.median(xyz[:, 2]))))
     found = veiled_parts(views, xyz, thumbnails, fixed)
-    return found, ((veiled_note([names[i] for i in found]),) if found else ())
+    return found, ((veiled_note([names[i] for i in sorted(found)]),) if found else ())
 
 
 def veiled_note(names: Sequence[str]) -> str:
@@ -88,17 +91,48 @@ def veiled_parts(
     xyz: NDArray[Any],
     thumbnails: Mapping[int, NDArray[Any]],
     fixed: Mapping[int, Blank],
+    *,
+    least: float = SURE_SHARE,
 ) -> dict[int, Blank]:
     """What is veiled in photos as seen from some views, by photo, only of photos where something
-    is; `xyz`: tie points (n, 3) on their ground, at least one.
+    is; `xyz`: tie points (n, 3) on their ground, at least one; `least`: share of a picture that
+    must surely be veiled, of one of them.
     """
-    views = [v for v in views if thumbnails[v.photo].dtype == np.uint8]
-    if len(views) < FEWEST_VIEWS:
-        return {}
+    found = dict[int, Blank]()
+    for group in _alike([v for v in views if thumbnails[v.photo].dtype == np.uint8]):
+        if len(group) >= FEWEST_VIEWS:
+            found |= _veiled(group, xyz, thumbnails, fixed, least)
+    return found
+
+
+def _alike(views: Sequence[View]) -> list[list[View]]:
+    """Views in groups of one camera and ground size: finer pictures of the same ground, and those
+    of other cameras, have another contrast.
+    """
+    groups, first = list[list[View]](), np.inf
+    cameras = {c: k for k, c in enumerate(dict.fromkeys(v.camera for v in views))}
+    sides = {v.photo: np.sqrt(cv2.contourArea(v.footprint.astype(np.float32))) for v in views}
+    for view in sorted(views, key=lambda v: (cameras[v.camera], sides[v.photo], v.photo)):
+        side = sides[view.photo]
+        if not groups or groups[-1][0].camera != view.camera or side > ALIKE * first:
+            groups.append([])
+            first = side
+        groups[-1].append(view)
+    return groups
+
+
+def _veiled(
+    views: Sequence[View],
+    xyz: NDArray[Any],
+    thumbnails: Mapping[int, NDArray[Any]],
+    fixed: Mapping[int, Blank],
+    least: float,
+) -> dict[int, Blank]:
+    """`veiled_parts` of photos of one camera and ground size."""
     seen = _Ground(views, xyz)
     looks = [seen.look(view, thumbnails[view.photo], fixed.get(view.photo)) for view in views]
-    least = seen.least()
-    if not any(_large(b > SURELY, SURE_SHARE).any() for b in _below(views, looks, least)):
+    usual = seen.least()
+    if not any(_large(b > SURELY, least).any() for b in _below(views, looks, usual)):
         return {}
     found = dict[int, Blank]()
     for view, below in zip(views, _below(views, looks, seen.clearest()), strict=True):

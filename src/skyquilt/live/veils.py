@@ -1,0 +1,144 @@
+"""Smoke, fog and haze on a growing map: what they veil is drawn only where no other photo shows the
+ground.
+
+As on the map at the end (`ortho.veiled`), here among a photo and those around it, so that a photo
+costs as much however large the map is.
+"""
+
+import json
+from typing import Any
+
+import numpy as np
+
+from skyquilt.imaging.blank import Blank, joined
+from skyquilt.imaging.nodes import View
+from skyquilt.imaging.views import footprint
+from skyquilt.live.doubled import tell_doubled
+from skyquilt.live.ledger import DAMAGED
+from skyquilt.live.links import LiveLinks
+from skyquilt.live.members import Member
+from skyquilt.live.tile_drawing import layer_of
+from skyquilt.model.photo import Photo
+from skyquilt.ortho.height_cells import HeightCells
+from skyquilt.ortho.tie_surface import level
+from skyquilt.ortho.veiled import FEWEST_VIEWS, cells_of, veiled_note, veiled_parts
+from skyquilt.outside import whole
+
+KEY, NOTED = "veil ", "veils noted"
+"""Names in the ledger of the veil of a photo, before its number, and of how many were noted."""
+SURE_SHARE = 0.1
+"""Share of a picture that the first one must surely show through a veil. More than on the map at
+the end: where photos are not well placed yet, what stands beside a place seems to veil it; of 75
+photos of `caliterra` up to 0.065.
+"""
+NEAREST = 20
+"""Most photos that are compared."""
+MORE = 0.02
+"""Share of a picture by which its veil must have grown to be drawn again."""
+AROUND = 5
+"""Cells around the photos' places in which the height of the ground is looked for."""
+MOST = 10**9
+"""Largest number of a photo."""
+
+
+class LiveVeils:
+    """Which parts of photos are veiled."""
+
+    def __init__(self, live_links: LiveLinks, heights: HeightCells) -> None:
+        """Reads what was known before a restart."""
+        self.live_links, self.members, self.heights = live_links, live_links.members, heights
+        kept = self.members.ledger.rows("select key, value from meta where key glob ?", f"{KEY}*")
+        found = {whole(key.removeprefix(KEY), 1, MOST): value for key, value in kept}
+        self._veils = dict[int, Blank]()
+        for member in self.members.by_id.values():
+            veil = _veil_from(found.get(member.id), member.photo)
+            if veil is not None:
+                self._veils[member.id] = veil
+
+    def of(self, number: int) -> Blank | None:
+        """The veiled part of a photo; None where it has none."""
+        return self._veils.get(number)
+
+    def look(self, member: Member) -> list[Member]:
+        """Judges a photo that has new links and those around it: what was seen as veiled once stays
+        so. Returns those of which clearly less is shown than before (inside a transaction of the
+        ledger).
+        """
+        ledger, new = self.members.ledger, list[int]()
+        for i, veil in sorted(self._found(member).items()):
+            before = self._veils.get(i)
+            both = veil if before is None else joined(before, veil)
+            if before is not None and _share(both) < _share(before) + MORE:
+                continue
+            room = np.round(np.clip(both.room, -1, 1).astype(np.float64), 2)
+            self._veils[i] = Blank(room=room.astype(np.float32), size=both.size)
+            ledger.put_meta(f"{KEY}{i}", room.ravel().tolist())
+            new.append(i)
+        if new:
+            note = veiled_note([self.members.by_id[i].photo.name for i in sorted(self._veils)])
+            count = len(self._veils)
+            tell_doubled(ledger, NOTED, count, lambda: [note if count < 2 else f"So far {note}"])
+        return [self.members.by_id[i] for i in new]
+
+    def _found(self, member: Member) -> dict[int, Blank]:
+        """What is veiled in a photo and in those around it, by their numbers."""
+        alike = self._around(member)
+        if len(alike) < FEWEST_VIEWS:
+            return {}
+        known = np.concatenate([m.pose.map_C[None, :2] for m in alike if m.pose is not None])
+        around = AROUND * self.heights.cell
+        ground = self.heights.median((*known.min(0) - around, *known.max(0) + around))
+        if ground is None:
+            return {}
+        views = [v for m in alike if (v := self._view(m, ground)) is not None]
+        if len(views) < FEWEST_VIEWS:
+            return {}
+        outline = np.concatenate([v.footprint for v in views])
+        xy = self.heights.places((*outline.min(0), *outline.max(0)))
+        xyz = np.column_stack([xy, np.full(len(xy), ground)])
+        thumbnails = {v.photo: self.live_links.thumbnail(v.photo) for v in views}
+        marks = {m.id: self.live_links.marks.shown(m.photo.camera_key) for m in alike}
+        fixed = {i: mark for i, mark in marks.items() if mark is not None}
+        if not len(xyz):
+            return {}
+        least = 0.0 if self._veils else SURE_SHARE
+        return veiled_parts(views, xyz, thumbnails, fixed, least=least)
+
+    def _around(self, member: Member) -> list[Member]:
+        """A photo, those that it is linked with, and the nearest that are linked with these."""
+        known = self.members.by_id
+        near = {member.id, *member.links}
+        near |= {j for i in member.links for j in known[i].links}
+        alike = [
+            m
+            for i in sorted(near)
+            if (m := known[i]).pose is not None and layer_of(m) == layer_of(member)
+        ]
+        if member.pose is not None:
+            own = member.pose.map_C
+            alike.sort(key=lambda m: float(np.linalg.norm(m.pose.map_C - own)) if m.pose else 0.0)
+        return alike[:NEAREST]
+
+    def _view(self, member: Member, ground: float) -> View | None:
+        """A photo's view of level ground at a height in m; None where it sees none."""
+        assert member.pose is not None
+        camera = self.members.camera(member)
+        outline = footprint(camera, member.pose, level(ground))
+        if not len(outline):
+            return None
+        return View(photo=member.id, camera=camera, pose=member.pose, footprint=outline)
+
+
+def _share(veil: Blank) -> float:
+    """Share of a picture that is veiled."""
+    return float((veil.room < 0).mean())
+
+
+def _veil_from(said: Any, photo: Photo) -> Blank | None:
+    """The veil of a photo as the ledger holds it; None where there is none, or it is damaged."""
+    rows, columns = cells_of(photo.width, photo.height)
+    try:
+        room = np.array(json.loads(said), np.float32).reshape(rows, columns)
+    except DAMAGED:
+        return None
+    return Blank(room=room, size=(photo.width, photo.height)) if np.isfinite(room).all() else None
