@@ -10,13 +10,15 @@ import rasterio
 from rasterio.windows import from_bounds
 
 from skyquilt.imaging.blank import around
-from skyquilt.ortho.veiled import find_veiled, fine_contrast
+from skyquilt.imaging.views import footprint, make_views
+from skyquilt.ortho.tie_surface import level
+from skyquilt.ortho.veiled import find_veiled, veiled_parts
 from skyquilt.settings import MosaicSettings
 from skyquilt.simulate import preset, simulate
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Pictures, Route
 from skyquilt.workflows.mosaic import mosaic
-from tests.ortho.scenes import placed
+from tests.ortho.scenes import CAMERA
 from tests.ortho.test_sharpness import flight
 from tests.ortho.test_spoilt import pictures
 
@@ -86,20 +88,21 @@ def test_clear_photos_stay_as_they_are(alignment, clean):
     assert found(apart, fog) == ({}, ())
 
 
-def test_photos_from_two_heights_are_compared_apart(alignment, clean):
-    """A picture from far above has less contrast than one from near, of ground with a fine pattern."""
-    low = flight(40, apart=2.0, across=2.0)
-    near = {
-        i + 12: replace(p, map_C=np.array([*(p.map_C[:2] + (12, 0)), 16.0]))
-        for i, p in low.poses.items()
-    }
-    both = placed(alignment.poses | near, alignment.ties)
-    rng = np.random.default_rng(3)
-    fine = np.kron(rng.integers(30, 220, (800, 800)), np.ones((4, 4))).astype(np.float32)
-    shown = pictures(both, fine)
-    contrast = [np.nanmedian(fine_contrast(shown[i])) for i in (5, 30)]
-    assert contrast[1] - contrast[0] > 0.6  # it is there
-    assert found(both, shown) == ({}, ())
+def test_photos_of_other_cameras_and_ground_sizes_are_compared_apart(alignment, clean):
+    """Every second photo has a third of the contrast, as from far above, or by another camera."""
+    flat = {i: p if i % 2 else np.rint(110 * (p / 110.0) ** 0.33).astype(np.uint8)
+            for i, p in clean.items()}  # fmt: skip
+    assert len(found(alignment, flat)[0]) > 4
+    names = {i: ("two", "one")[i % 2] for i in clean}
+    cameras = {"one": CAMERA, "two": replace(CAMERA, focal=CAMERA.focal + 1)}
+    assert found(replace(alignment, cameras=cameras, camera_of=names), flat) == ({}, ())
+    views = make_views(alignment, level(0.0))
+    high = [
+        v if v.photo % 2 else replace(v, pose=replace(v.pose, map_C=v.pose.map_C * (1, 1, 1.5)))
+        for v in views
+    ]
+    high = [replace(v, footprint=footprint(v.camera, v.pose, level(0.0))) for v in high]
+    assert veiled_parts(high, alignment.ties.xyz, flat, {}) == {}
 
 
 def test_waves_marks_and_empty_corners_veil_nothing(alignment, clean):
