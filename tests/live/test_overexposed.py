@@ -11,6 +11,7 @@ from PIL import Image
 from skyquilt.live.live_map import LiveMap
 from skyquilt.live.settings import LiveSettings
 from skyquilt.live.tile_drawing import WHOLE, Canvas
+from skyquilt.live.veils import LiveVeils
 from skyquilt.ortho.blend import Feather
 from skyquilt.simulate.settings import Control, Route
 from tests.live.conftest import fed, made
@@ -56,6 +57,7 @@ def maps(flown, tmp_path_factory):
     ]
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(Canvas, "_overexposed", lambda *_: None)
+        patched.setattr(LiveVeils, "look", lambda *_: [])  # white has no contrast, either
         found.append(fed(LiveMap(folder / "all", settings), paths))
     yield found
     for live in found:

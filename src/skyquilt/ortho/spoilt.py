@@ -19,7 +19,7 @@ from skyquilt.ortho.exposure import Balance, Samples
 from skyquilt.ortho.radiometry import InGrey
 from skyquilt.ortho.sharpness import FEWEST_SPOILT, LARGEST_SPOT, find_blurred
 from skyquilt.ortho.tie_surface import level
-from skyquilt.ortho.veiled import find_veiled
+from skyquilt.ortho.veiled import find_veiled, veiled_note
 from skyquilt.photos.side_rows import sentence_of
 
 WHITE = 250
@@ -69,8 +69,11 @@ def spoilt_parts(
     if white:
         notes += (overexposed_note([names[i] for i in white]),)
     spots, told = find_spots(alignment, thumbnails)
-    veiled, seen = find_veiled(alignment, thumbnails, names, fixed)
-    notes += told + seen
+    notes += told
+    veiled = find_veiled(alignment, thumbnails, fixed)
+    # what is overexposed or blurred has little contrast as well, and was told
+    if unnamed := sorted(veiled.keys() - white.keys() - blurred.keys()):
+        notes += (veiled_note([names[i] for i in unnamed]),)
     out = dict(fixed)
     for found in (blurred, white, spots, veiled):
         out |= {i: joined(out[i], b) if i in out else b for i, b in found.items()}

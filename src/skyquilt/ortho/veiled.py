@@ -59,21 +59,17 @@ KNOWN = 0.3
 
 
 def find_veiled(
-    alignment: Alignment,
-    thumbnails: Mapping[int, NDArray[Any]],
-    names: Sequence[str],
-    fixed: Mapping[int, Blank],
-) -> tuple[dict[int, Blank], tuple[str, ...]]:
-    """What smoke, fog or haze veils, by photo (index), only of photos where something is, and
-    notes. `thumbnails`: (h, w[, bands]) of the photos, of which those of 8 bits are judged; `names`
-    of the photos; `fixed`: where they show marks.
+    alignment: Alignment, thumbnails: Mapping[int, NDArray[Any]], fixed: Mapping[int, Blank]
+) -> dict[int, Blank]:
+    """What smoke, fog or haze veils, by photo (index), only of photos where something is.
+    `thumbnails`: (h, w[, bands]) of the photos, of which those of 8 bits are judged; `fixed`: where
+    they show marks.
     """
     xyz = alignment.ties.xyz
     if not len(xyz):
-        return {}, ()
+        return {}
     views = make_views(alignment, level(float(np.median(xyz[:, 2]))))
-    found = veiled_parts(views, xyz, thumbnails, fixed)
-    return found, ((veiled_note([names[i] for i in sorted(found)]),) if found else ())
+    return veiled_parts(views, xyz, thumbnails, fixed)
 
 
 def veiled_note(names: Sequence[str]) -> str:
