@@ -17,9 +17,9 @@ WAIT_S = 0.1
 """Longest pause in s between checks for new events."""
 LISTEN_S = 0.02
 """Pause in s between checks whether the survey may have changed."""
-KEEP_ALIVE_S = 15.0
-"""If there are no events, a comment is sent at this interval in s, so that clients know that the
-connection is alive.
+KEEP_ALIVE_S = 5.0
+"""If there are no events, `here` is sent at this interval in s: a client that hears nothing for
+longer has lost the connection. (A comment would do for proxies, but pages do not see comments.)
 """
 
 
@@ -60,7 +60,7 @@ class EventEndpoints:
             quiet = 0.0 if told else quiet + WAIT_S
             if quiet >= KEEP_ALIVE_S:
                 quiet = 0.0
-                yield ": still here\n\n"
+                yield "event: here\ndata: {}\n\n"
             if len(told) < 100:
                 await self._pause()
 

@@ -1,7 +1,9 @@
 "use strict";
 // What all parts of the page share. The page never builds HTML from what photos or layers say: text goes in as text.
 const $ = (id) => document.getElementById(id);
-const map = L.map("map", { zoomControl: true, maxZoom: 25, preferCanvas: true }).setView([0, 0], 2);
+const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
+const map = L.map("map", { zoomControl: true, maxZoom: 25, preferCanvas: true, zoomAnimation: !still, fadeAnimation: !still, inertia: !still }).setView([0, 0], 2);
+if (still) map.panBy = (by, options) => L.Map.prototype.panBy.call(map, by, { ...options, animate: false });
 L.control.scale({ imperial: false }).addTo(map);
 map.createPane("first").style.zIndex = 240;
 map.createPane("second").style.zIndex = 250;
@@ -23,6 +25,8 @@ const writing = (more) => ({ ...more, ...($("token").value ? { "X-Token": $("tok
 // The map shows its focus, and its middle, to those who use the keyboard.
 document.addEventListener("keydown", (e) => { if (e.key === "Tab") document.body.classList.add("keys"); }, true);
 document.addEventListener("pointerdown", () => document.body.classList.remove("keys"), true);
+// Browsers hand on a touch as a mouse, too: nothing lies under a finger's cursor once the finger is gone.
+for (const name of ["pointerdown", "pointermove"]) document.addEventListener(name, (e) => { state.touched = e.pointerType === "touch"; }, true);
 // An item of a list that can be chosen: by mouse anywhere, by keyboard and screen reader as the button that its name becomes.
 const choosable = (li, work) => {
   const name = li.querySelector("span"), go = element("button", undefined, "quiet");
@@ -32,8 +36,10 @@ const choosable = (li, work) => {
   li.onclick = work;
   return li;
 };
+// Longest time in ms that an answer may take. What hangs on a weak link would keep others from the few connections of a browser.
+const PATIENCE_MS = 60000;
 const asked = async (url, options) => {
-  const answer = await fetch(url, options);
+  const answer = await fetch(url, options || { signal: AbortSignal.timeout(PATIENCE_MS) }).catch(() => { throw new Error("the server does not answer"); });
   const said = await answer.json().catch(() => ({}));
   if (!answer.ok) throw new Error(typeof said.detail === "string" ? said.detail : `the server answers ${answer.status}`);
   return said;

@@ -10,14 +10,20 @@ const Growing = L.GridLayer.extend({
     return img;
   },
   fill(img, { x, y, z }, empty) {
-    const url = `tiles/${z}/${x}/${y}?layer=${encodeURIComponent(this.options.layer)}&v=${state.last}`;
-    fetch(url).then((r) => r.status === 200 ? r.blob() : null).then((blob) => {
+    const url = `tiles/${z}/${x}/${y}?layer=${encodeURIComponent(this.options.layer)}`;
+    img.lost = false;
+    fetch(url, { signal: AbortSignal.timeout(PATIENCE_MS) }).then((r) => {
+      if (!r.ok && r.status !== 404) throw new Error(r.status);
+      return r.status === 200 ? r.blob() : null;
+    }).then((blob) => {
       if (!blob) { img.removeAttribute("src"); img.style.visibility = "hidden"; if (empty) empty(); return; }
       const address = URL.createObjectURL(blob), next = new Image();
       next.onload = () => { img.src = address; img.style.visibility = "inherit"; setTimeout(() => URL.revokeObjectURL(address), 1000); if (!empty) window.drawnTiles = (window.drawnTiles || 0) + 1; };
       next.src = address;
-    }).catch(() => { if (empty) empty(); });
+    }).catch(() => { img.lost = true; if (empty) empty(); });
   },
+  // What did not come over a weak link is asked for again.
+  again() { for (const { el, coords } of Object.values(this._tiles)) if (el.lost) this.fill(el, this._wrapCoords(coords), null); },
   refresh(boxes) {
     for (const key of Object.keys(this._tiles)) {
       const tile = this._tiles[key], place = this._tileCoordsToBounds(tile.coords);
@@ -127,7 +133,9 @@ $("base").onclick = () => {
   if (on) { base = L.tileLayer("https://tile.openstreetmap.org/{z}/{x}/{y}.png", { maxNativeZoom: 19, maxZoom: 25, zIndex: 0, attribution: "© OpenStreetMap contributors" }).addTo(map); base.once("tileerror", () => say("the base map cannot be reached; everything else works without")); }
 };
 $("fit").onclick = fit;
-$("fold").onclick = () => { const folded = document.body.classList.toggle("folded"); $("fold").setAttribute("aria-expanded", String(!folded)); map.invalidateSize(); };
+const fold = (folded) => { document.body.classList.toggle("folded", folded); $("fold").setAttribute("aria-expanded", String(!folded)); map.invalidateSize(); };
+$("fold").onclick = () => fold(!document.body.classList.contains("folded"));
+document.querySelector(".skip").onclick = () => fold(false);
 $("export").onclick = () => { const b = map.getBounds(); $("export").href = `export?bbox=${[b.getWest(), b.getSouth(), b.getEast(), b.getNorth()].join(",")}&layer=${encodeURIComponent(shownName())}`; };
 
 // -- coordinates and height under the cursor ------------------------------------------------------------------
@@ -146,5 +154,5 @@ const readPlace = async () => {
   try { const said = await asked(`at?lon=${at.lng}&lat=${at.lat}`); $("where").textContent = [degrees(at), placeText(said)].filter(Boolean).join(" · "); } catch { /* the degrees stay */ }
   setTimeout(() => { hovering = false; readPlace(); }, 120);
 };
-map.on("mousemove", (e) => { if (!state.fitted || state.info.placeless) return; $("where").textContent = degrees(e.latlng); hover = e.latlng; readPlace(); });
+map.on("mousemove", (e) => { if (!state.fitted || state.info.placeless || state.touched) return; $("where").textContent = degrees(e.latlng); hover = e.latlng; readPlace(); });
 map.on("mouseout", () => { hover = null; $("where").textContent = ""; });

@@ -45,7 +45,7 @@ const measure = async () => {
   if (!mode) { $("measured").textContent = ""; $("graph").hidden = true; return; }
   (closed(mode) ? L.polygon : L.polyline)(p, { color: "#c20000", weight: 4 }).addTo(drawn);
   for (const at of p) L.circleMarker(at, { radius: 6, color: "#c20000" }).addTo(drawn);
-  if (!p.length) { $("measured").textContent = "Click on the map; with the keyboard, Enter sets a point in its middle."; $("graph").hidden = true; return; }
+  if (!p.length) { $("measured").textContent = "Click or tap on the map; with the keyboard, Enter sets a point in its middle."; $("graph").hidden = true; return; }
   try {
     const found = await finding(mode, p);
     if (mine !== reading) return;
@@ -60,6 +60,7 @@ const setMode = (mode) => {
   for (const name of MODES) pressed(name, state.mode === name);
   map.getContainer().style.cursor = state.mode ? "crosshair" : "";
   $("cross").hidden = !state.mode;
+  state.mode ? map.doubleClickZoom.disable() : map.doubleClickZoom.enable();  // two quick points are no zoom
   measure();
 };
 for (const name of MODES) $(name).onclick = () => setMode(name);
@@ -113,7 +114,13 @@ map.getContainer().addEventListener("keydown", (e) => {
   if (e.key === "Enter") { chosen(map.getCenter()); }
   if (e.key === "Backspace" && state.mode) undoPoint();
 });
-document.addEventListener("keydown", (e) => { if (e.key === "Escape" && !$("big").open) { if (state.picking) stopPicking(); if (state.mode) setMode(null); marked.clearLayers(); } });
+document.addEventListener("keydown", (e) => { if (e.key === "Escape" && !$("big").open) { if (!state.picking && !state.mode) leaveHere(); if (state.picking) stopPicking(); if (state.mode) setMode(null); marked.clearLayers(); } });
+// The photos of a place are put away; the focus does not get lost with them.
+const leaveHere = () => {
+  if ($("here").contains(document.activeElement)) map.getContainer().focus();
+  $("here").hidden = true;
+  marked.clearLayers();
+};
 map.getContainer().addEventListener("focus", () => { $("cross").hidden = !(state.mode || state.picking || document.body.classList.contains("keys")); });
 map.getContainer().addEventListener("blur", () => { $("cross").hidden = !(state.mode || state.picking); });
 const clicked = (at) => {

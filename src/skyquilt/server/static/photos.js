@@ -24,8 +24,9 @@ const listPhotos = () => {
   for (const flown of bySource.values()) {
     const color = colours[k++ % colours.length];
     const line = flown.sort((a, b) => timeOf(a) - timeOf(b) || a.id - b.id).map((p) => [p.at[1], p.at[0]]);
+    L.polyline(line, { color: "#fff", weight: 7, interactive: false }).addTo(trails);  // dark ground in sunlight would hide the track
     L.polyline(line, { color, weight: 3, interactive: false }).addTo(trails);
-    for (const at of line.slice(-400)) L.circleMarker(at, { radius: 4, color, interactive: false }).addTo(trails);
+    for (const at of line.slice(-400)) L.circleMarker(at, { radius: 4, color, fillColor: "#fff", fillOpacity: 1, interactive: false }).addTo(trails);
   }
   state.tracks = [...bySource.values()].map((flown) => flown.map((p) => p.id));
   for (const p of [...photos].reverse().slice(0, 300)) {
@@ -62,6 +63,7 @@ const ringOf = (p) => p.ring.map(([x, y]) => [y, x]);
 const photosHere = async (at) => {
   const said = await asked(`photos?lon=${at.lng}&lat=${at.lat}`);
   $("here").hidden = false;
+  fold(false);  // the answer is in the panel
   const mark = (p, li) => {
     for (const other of $("covering").children) { other.classList.remove("chosen"); for (const img of other.querySelectorAll("img")) img.remove(); }
     li.classList.add("chosen");
@@ -98,7 +100,11 @@ const showBig = async (p, at) => {
   open.href = img.src; open.target = "_blank"; open.rel = "noopener";
   const head = element("header");
   head.append(element("strong", p.name), open, close);
+  img.onerror = () => say("the photo cannot be loaded");
   sheet.append(img);
+  sheet.tabIndex = 0;
+  sheet.setAttribute("role", "group");
+  sheet.setAttribute("aria-label", "photo: arrow keys move it");
   box.replaceChildren(head, sheet);
   if (!box.open) box.showModal();
   const place = await asked(`photos/${p.id}/place?lon=${at.lng}&lat=${at.lat}`).catch(() => null);

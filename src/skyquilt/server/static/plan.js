@@ -110,6 +110,8 @@
   const done = () => {
     if (open && open.ring.length > 2) { shapes.push(open); keep(); }
     open = null;
+    state.picking = null;
+    document.getElementById("cross").hidden = !state.mode;
     drawArea.setAttribute("aria-pressed", "false"); drawClosed.setAttribute("aria-pressed", "false");
     map.getContainer().style.cursor = ""; map.doubleClickZoom.enable();
     show();
@@ -118,20 +120,22 @@
     const on = b.getAttribute("aria-pressed") === "true";
     done();
     if (on) return;
+    if (state.mode) setMode(null);
     open = { closed, ring: [] };
+    state.picking = ({ lat, lng }) => { open.ring.push([lat, lng]); show(); };
+    document.getElementById("cross").hidden = false;
     b.setAttribute("aria-pressed", "true");
     map.getContainer().style.cursor = "crosshair"; map.doubleClickZoom.disable();
-    said.textContent = "Click the corners; press the button again to end.";
+    said.textContent = "Click or tap the corners, or press Enter for the middle of the map; press the button again to end.";
   };
   drawArea.onclick = begin(false, drawArea); drawClosed.onclick = begin(true, drawClosed);
   clear.onclick = () => { shapes = []; open = null; keep(); done(); said.textContent = ""; };
-  map.getContainer().addEventListener("click", (e) => {
-    if (!open || !e.target.closest || e.target.closest(".leaflet-control")) return;
-    e.stopPropagation();
-    const { lat, lng } = map.mouseEventToLatLng(e);
-    open.ring.push([lat, lng]);
-    show();
-  }, true);
+  // Backspace takes the last corner back, Escape the whole area
+  document.addEventListener("keydown", (e) => {
+    if (!open) return;
+    if (e.key === "Escape") { open = null; done(); said.textContent = ""; }
+    if (e.key === "Backspace" && e.target === map.getContainer()) { open.ring.pop(); show(); }
+  });
   const sent = async (url, body) => {
     const answer = await fetch(url, { method: "POST", body, headers: headers({ "Content-Type": "application/json" }) }).catch(() => null);
     if (!answer) { said.textContent = "the server does not answer"; return; }
@@ -168,20 +172,19 @@
   unsure();
 
   // -- news
-  const listen = () => {
-    const news = new EventSource("events");
-    news.onopen = () => { readSoon(); coverSoon(); };
-    news.onerror = () => { if (news.readyState === 2) setTimeout(listen, 2000); };
-    news.addEventListener("plan", (e) => {
-      const told = JSON.parse(e.data);
-      if (told.text) said.textContent = told.text;
-      if (told.state === "ready") ready(told.name).catch(() => {});
-      readSoon();
-    });
-    news.addEventListener("coverage", coverSoon);
-    news.addEventListener("areas", () => readAreas().catch(() => {}));
-  };
+  document.addEventListener("plan", ({ detail: told }) => {
+    if (told.text) said.textContent = told.text;
+    if (told.state === "ready") ready(told.name).catch(() => {});
+    readSoon();
+  });
+  document.addEventListener("coverage", coverSoon);
+  document.addEventListener("areas", () => readAreas().catch(() => {}));
+  // a finished map has no plan
+  section.hidden = true;
+  document.addEventListener("connected", () => {
+    section.hidden = !state.info || !state.info.growing;
+    if (!section.hidden) read().then(readCover).then(readAreas).catch(() => {});
+  });
   show();
-  read().then(readCover).catch(() => {}).then(() => { if (!section.hidden) { readAreas().catch(() => {}); listen(); } });
   window.skyquilt.plan = { shapes: () => shapes, marks, cover: () => sharing, provisional };
 })();

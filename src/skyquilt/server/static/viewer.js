@@ -63,16 +63,43 @@ const explain = () => {
 let again = null;
 const readInfoSoon = () => { if (!again) again = setTimeout(() => { again = null; readInfo().catch(() => {}); }, 400); };
 
-const told = (kind, use) => (e) => { state.last = Math.max(state.last, Number(e.lastEventId) || 0); use(JSON.parse(e.data)); };
+const told = (kind, use) => (e) => { heard = Date.now(); state.last = Math.max(state.last, Number(e.lastEventId) || 0); use(JSON.parse(e.data)); };
 const photoNews = (p) => {
   const known = state.photos.get(p.id) || {}, { time, ...rest } = p;
   state.photos.set(p.id, { received: Date.now() / 1000, ...known, ...(p.state !== known.state ? { reason: "" } : {}), ...rest, time: known.time || (time ? Date.parse(/[zZ]|[+-]\d\d:?\d\d$/.test(time) ? time : `${time}Z`) / 1000 : null) });
   listSoon(); readInfoSoon();
 };
+// -- the connection ---------------------------------------------------------------------------------------------
+// The server says every 5 s that it is there. So silence is a lost connection, also where a weak network drops it without a word.
+const SILENT_MS = 15000;
+let news = null, heard = Date.now(), tried = 0, mended = 0, gone = false;
+const mend = () => { mended = Date.now(); for (const layer of [first, second]) if (layer) layer.again(); };
+const lost = () => {
+  if (gone) return;
+  gone = true;
+  $("link").textContent = "lost, trying";
+  $("link").className = "lost";
+  const since = new Date(heard).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit" });
+  $("stale").textContent = `No connection since ${since}. ${state.info && state.info.growing ? "The map is as it was then; it goes on when the server answers." : "What is not loaded yet is missing until the server answers."}`;
+};
+const back = () => {
+  heard = Date.now();
+  if (gone) say("Connected again.");
+  gone = false;
+  $("link").textContent = state.info && state.info.growing ? "live" : "open";
+  $("link").className = "live";
+  $("stale").textContent = "";
+  mend();
+  catchUp().then(() => document.dispatchEvent(new Event("connected")));
+};
 const listen = () => {
-  const news = new EventSource(`events?after=${state.last}`);
-  news.onopen = () => { $("link").textContent = state.info && state.info.growing ? "live" : "open"; $("link").className = "live"; catchUp(); };
-  news.onerror = () => { $("link").textContent = "lost, trying"; $("link").className = "lost"; if (news.readyState === 2) setTimeout(listen, 1000); };
+  if (news) news.close();
+  tried = Date.now();
+  news = new EventSource(`events?after=${state.last}`);
+  news.onopen = back;
+  news.onerror = lost;
+  news.addEventListener("here", () => { heard = Date.now(); });
+  for (const kind of ["plan", "coverage", "areas"]) news.addEventListener(kind, told(kind, (said) => document.dispatchEvent(new CustomEvent(kind, { detail: said }))));
   news.addEventListener("photo", told("photo", photoNews));
   news.addEventListener("tiles", told("tiles", (t) => {
     const boxes = (t.boxes || [t.bounds]).map(([west, south, east, north]) => L.latLngBounds([south, west], [north, east]));
@@ -84,6 +111,14 @@ const listen = () => {
   news.addEventListener("finish", told("finish", (f) => { say(f.text || `final map: ${f.state}`); readInfoSoon(); }));
   news.addEventListener("map", told("map", readInfoSoon));
 };
+const watch = () => {
+  if (!news) return;
+  if (news.readyState === 2 || Date.now() - Math.max(heard, tried) > SILENT_MS) { lost(); listen(); }
+  else if (!gone && Date.now() - mended > 10000) mend();
+};
+setInterval(watch, 2000);
+document.addEventListener("visibilitychange", watch);  // a phone that was locked
+window.addEventListener("online", () => { if (gone) listen(); });
 const catchUp = () => Promise.all([readInfo(), readPhotos(), readOverlays(), readFiles(), readControl()]).catch(() => {});
 readInfo().catch(() => say("the server does not answer")).then(listen);
 window.skyquilt = { map, state };
