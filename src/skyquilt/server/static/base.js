@@ -2,7 +2,7 @@
 // What all parts of the page share. The page never builds HTML from what photos or layers say: text goes in as text.
 const $ = (id) => document.getElementById(id);
 const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
-const map = L.map("map", { zoomControl: true, maxZoom: 25, preferCanvas: true, zoomAnimation: !still, fadeAnimation: !still, inertia: !still }).setView([0, 0], 2);
+const map = L.map("map", { zoomControl: true, maxZoom: 25, preferCanvas: true, inertia: !still }).setView([0, 0], 2);
 if (still) map.panBy = (by, options) => L.Map.prototype.panBy.call(map, by, { ...options, animate: false });
 L.control.scale({ imperial: false }).addTo(map);
 map.createPane("first").style.zIndex = 240;

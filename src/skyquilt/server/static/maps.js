@@ -6,7 +6,8 @@ const Growing = L.GridLayer.extend({
     img.alt = "";
     img.onload = () => done(null, img);
     img.onerror = () => { img.removeAttribute("src"); done(null, img); };
-    this.fill(img, coords, () => done(null, img));
+    img.empty = () => done(null, img);
+    this.fill(img, coords, img.empty);
     return img;
   },
   fill(img, { x, y, z }, empty) {
@@ -20,10 +21,10 @@ const Growing = L.GridLayer.extend({
       const address = URL.createObjectURL(blob), next = new Image();
       next.onload = () => { img.src = address; img.style.visibility = "inherit"; setTimeout(() => URL.revokeObjectURL(address), 1000); if (!empty) window.drawnTiles = (window.drawnTiles || 0) + 1; };
       next.src = address;
-    }).catch(() => { img.lost = true; if (empty) empty(); });
+    }).catch(() => { img.lost = true; });  // not done: what was shown there before stays
   },
   // What did not come over a weak link is asked for again.
-  again() { for (const { el, coords } of Object.values(this._tiles)) if (el.lost) this.fill(el, this._wrapCoords(coords), null); },
+  again() { for (const { el, coords } of Object.values(this._tiles)) if (el.lost) this.fill(el, this._wrapCoords(coords), el.empty); },
   refresh(boxes) {
     for (const key of Object.keys(this._tiles)) {
       const tile = this._tiles[key], place = this._tileCoordsToBounds(tile.coords);
