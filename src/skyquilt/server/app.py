@@ -49,6 +49,7 @@ class Packed:
         self.plain, self.packing = app, GZipMiddleware(app, minimum_size=1000, compresslevel=6)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """One request."""
         text = scope["type"] == "http" and scope["method"] == "GET"
         text = text and (scope["path"] in ("/", "/photos") or scope["path"].startswith("/static/"))
         await (self.packing if text else self.plain)(scope, receive, send)
