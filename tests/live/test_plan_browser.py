@@ -78,6 +78,31 @@ def test_an_area_and_a_keep_out_are_drawn_and_planned(page, tmp_path):  # noqa: 
         assert not page.errors
 
 
+def test_an_area_is_drawn_by_keyboard(page, tmp_path):  # noqa: F811
+    """Enter sets a corner in the middle of the map, Backspace takes it back, Escape all of them."""
+    with watched(tmp_path / "out", None) as (_, _web, url):
+        page.goto(url)
+        page.wait_for_selector("#link.live")
+        page.wait_for_selector("#mission:visible")
+        page.evaluate("skyquilt.map.setView([52.1, 13.1], 18, { animate: false })")
+        page.focus("#draw-area")
+        page.keyboard.press("Enter")
+        page.focus("#map")
+        for key in ("Enter", "ArrowRight", "Enter", "ArrowDown", "Enter", "Backspace", "Enter"):
+            page.keyboard.press(key)
+            page.wait_for_timeout(350)  # the map glides
+        page.locator("#draw-area").press("Enter")
+        shapes = "skyquilt.plan.shapes().map(s => [s.closed, s.ring.length])"
+        assert page.evaluate(shapes) == [[False, 3]]
+        page.locator("#draw-closed").press("Enter")
+        page.locator("#map").press("Enter")
+        page.keyboard.press("Escape")
+        assert page.get_attribute("#draw-closed", "aria-pressed") == "false"
+        assert page.evaluate(shapes) == [[False, 3]]
+        assert page.locator("#covering li").count() == 0  # no photos were asked for
+        assert not page.errors
+
+
 def test_photos_placed_by_their_metadata_are_pale_until_they_are_refined(page, flight, tmp_path):  # noqa: F811
     """A dashed outline, and a fifth of white over what is not sure yet, however many photos show
     it; gone when they are refined.
