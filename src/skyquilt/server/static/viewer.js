@@ -80,7 +80,7 @@ const lost = () => {
   $("link").textContent = "lost, trying";
   $("link").className = "lost";
   const since = new Date(heard).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit" });
-  $("stale").textContent = `No connection since ${since}. ${state.info && state.info.growing ? "The map is as it was then; it goes on when the server answers." : "What is not loaded yet is missing until the server answers."}`;
+  $("stale").textContent = `No connection since ${since}: ${state.info && state.info.growing ? "the map is as it was then." : "what is not loaded yet is missing."}`;
 };
 const back = () => {
   heard = Date.now();
