@@ -1,4 +1,4 @@
-"""Who may do what: tokens, hosts, limits, headers; and what all addresses share."""
+"""Who may do what: tokens, hosts, limits, headers, packing; and what all addresses share."""
 
 import asyncio
 import hmac
@@ -16,6 +16,7 @@ from urllib.parse import urlsplit
 from fastapi import HTTPException, Request
 from fastapi.responses import JSONResponse
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.middleware.gzip import GZipMiddleware
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -165,6 +166,21 @@ def local(host: str) -> bool:
         return ipaddress.ip_address(bare).is_loopback
     except ValueError:
         return False
+
+
+class Packed:
+    """Sends long texts compressed to those who take them so: the page's scripts and the list of
+    photos are most of what a viewer loads over a weak link. Pictures and files are left alone.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.plain, self.packing = app, GZipMiddleware(app, minimum_size=1000, compresslevel=6)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """One request."""
+        text = scope["type"] == "http" and scope["method"] == "GET"
+        text = text and (scope["path"] in ("/", "/photos") or scope["path"].startswith("/static/"))
+        await (self.packing if text else self.plain)(scope, receive, send)
 
 
 class Guarded:

@@ -11,11 +11,9 @@ from typing import TYPE_CHECKING
 from fastapi import FastAPI, Request, Response
 from fastapi.responses import FileResponse, JSONResponse, StreamingResponse
 from fastapi.staticfiles import StaticFiles
-from starlette.middleware.gzip import GZipMiddleware
-from starlette.types import ASGIApp, Receive, Scope, Send
 
 from skyquilt.errors import SideFileError
-from skyquilt.server.access import RESUMABLE, Context, Guard, Guarded, Writer
+from skyquilt.server.access import RESUMABLE, Context, Guard, Guarded, Packed, Writer
 from skyquilt.server.control_endpoints import ControlEndpoints
 from skyquilt.server.event_endpoints import EventEndpoints
 from skyquilt.server.file_endpoints import FileEndpoints
@@ -38,21 +36,6 @@ if TYPE_CHECKING:
 def _damaged(_: Request, error: Exception) -> Response:
     """A file of the map that could be read when it was opened."""
     return JSONResponse({"detail": str(error)}, 503)
-
-
-class Packed:
-    """Sends long texts compressed to those who take them so: the page's scripts and the list of
-    photos are most of what a viewer loads over a weak link. Pictures and files are left alone.
-    """
-
-    def __init__(self, app: ASGIApp) -> None:
-        self.plain, self.packing = app, GZipMiddleware(app, minimum_size=1000, compresslevel=6)
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One request."""
-        text = scope["type"] == "http" and scope["method"] == "GET"
-        text = text and (scope["path"] in ("/", "/photos") or scope["path"].startswith("/static/"))
-        await (self.packing if text else self.plain)(scope, receive, send)
 
 
 def make_app(
