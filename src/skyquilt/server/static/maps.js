@@ -1,6 +1,12 @@
 "use strict";
 // A tile that changes is fetched first and swapped then: nothing flickers while the map grows.
 const Growing = L.GridLayer.extend({
+  // Where the view jumps, too, what is shown stays, moved or enlarged, until tiles of the new view are there: a weak link takes seconds.
+  getEvents() {
+    const events = L.GridLayer.prototype.getEvents.call(this);
+    delete events.viewprereset;
+    return events;
+  },
   createTile(coords, done) {
     const img = element("img");
     img.alt = "";

@@ -118,7 +118,7 @@ const watch = () => {
 };
 setInterval(watch, 2000);
 document.addEventListener("visibilitychange", watch);  // a phone that was locked
-window.addEventListener("online", () => { if (gone) listen(); });
+window.addEventListener("online", () => { gone ? listen() : mend(); });
 const catchUp = () => Promise.all([readInfo(), readPhotos(), readOverlays(), readFiles(), readControl()]).catch(() => {});
 readInfo().catch(() => say("the server does not answer")).then(listen);
 window.skyquilt = { map, state };
