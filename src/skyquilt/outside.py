@@ -11,6 +11,7 @@ import os
 import re
 import sqlite3
 import stat
+import sys
 import time
 import unicodedata
 from collections.abc import Callable, Iterator
@@ -32,6 +33,8 @@ MOST_VALUE_BYTES = 256_000_000
 """Largest value of a row: a layer as text has some 100 MB."""
 MOST_QUERY_S = 60.0
 """CPU time after which a query is given up."""
+BUSY_S = 3.0
+"""Time in s for which a file that another program reads is waited for."""
 MOST_ASPECT = 20
 """Largest ratio of a photo's sides."""
 LEAST_SIDE = 32
@@ -114,6 +117,22 @@ def open_regular(path: Path) -> BinaryIO:
 def _at_once(path: str, flags: int) -> int:
     """Opens without waiting for a writer at the other end of a pipe."""
     return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+
+
+def put_in_place(partial: Path, path: Path) -> None:
+    """Gives a complete file or folder its name, in place of the file that had it. Windows refuses
+    that while another program reads one of them, as viewers and virus scanners do for a moment: it
+    is tried again for a short time.
+    """
+    until = time.monotonic() + BUSY_S
+    while True:
+        try:
+            partial.replace(path)
+            return
+        except PermissionError:
+            if sys.platform != "win32" or time.monotonic() > until:
+                raise
+        time.sleep(0.02)
 
 
 def is_file(path: Path) -> bool:

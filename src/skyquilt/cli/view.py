@@ -2,7 +2,7 @@
 live.
 """
 
-import threading
+import time
 from pathlib import Path
 from typing import Annotated
 
@@ -53,4 +53,5 @@ def command(
     watch = ends_run(limit_bytes(max_memory), "start it again with a larger --max-memory")
     with watch, ServerThread(survey=survey, guard=guard, folder=folder, port=port) as serving:
         typer.echo(f"{serving.url} shows {plain(str(folder))}; Ctrl-C ends")
-        threading.Event().wait()
+        while True:  # on Windows Ctrl-C ends no other way of waiting
+            time.sleep(60)

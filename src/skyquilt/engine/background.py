@@ -32,7 +32,13 @@ class Background(Generic[T]):
         """
         task = pickle.dumps((work, argument))
         command = [sys.executable, "-P", "-c", _ENTRY]  # -P: not from the working folder
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        self._process = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            # on Windows, as `nice` in `serve`: the parent process has priority
+            creationflags=getattr(subprocess, "BELOW_NORMAL_PRIORITY_CLASS", 0),
+        )
         self._outcome: T | None = None
         self._talk = threading.Thread(target=self._exchange, args=(task,), daemon=True)
         self._talk.start()
@@ -85,8 +91,9 @@ def serve() -> None:
     standard output.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl+C is handled by the parent process
-    with suppress(OSError, AttributeError):
-        os.nice(10)  # the parent process has priority
+    if sys.platform != "win32":
+        with suppress(OSError):
+            os.nice(10)  # the parent process has priority
     answer = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # output printed by libraries must not mix with the result
     work, argument = pickle.load(sys.stdin.buffer)

@@ -116,12 +116,12 @@ def peak_memory_mb() -> float | None:
     """
     with suppress(OSError, ValueError, StopIteration):
         # Linux counts into the other figure what the process that started this one held
-        lines = Path("/proc/self/status").read_text().splitlines()
+        lines = Path("/proc/self/status").read_text("utf-8").splitlines()
         return int(next(s for s in lines if s.startswith("VmHWM")).split()[1]) * 1024 / 1e6
-    try:
-        import resource
-    except ImportError:
+    if sys.platform == "win32":
         return None
+    import resource
+
     unit = 1e6 if sys.platform == "darwin" else 1e6 / 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from skyquilt.engine import error_log
 from skyquilt.engine.lock import FolderLock
 from skyquilt.errors import OutputError
-from skyquilt.outside import open_regular, plain, read_bounded
+from skyquilt.outside import open_regular, plain, put_in_place, read_bounded
 from skyquilt.version import __version__
 
 CONTRACT = (
@@ -80,8 +80,8 @@ class RunFolder:
             if state == "done":
                 record["files"] = {n: s for n in LASTING if (s := stamp(self.path / n))}
             target.parent.mkdir(parents=True, exist_ok=True)  # removed by somebody while it ran
-            partial.write_text(json.dumps(record))
-            partial.replace(target)
+            partial.write_text(json.dumps(record), encoding="utf-8")
+            put_in_place(partial, target)
         except OSError as error:
             partial.unlink(missing_ok=True)
             raise refusal(self.path, error) from error

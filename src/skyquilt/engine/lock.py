@@ -3,17 +3,20 @@
 import errno
 import json
 import os
+import sys
 from contextlib import suppress
 from pathlib import Path
 
 from skyquilt.errors import OutputError
 from skyquilt.outside import plain, read_bounded
 
-try:
+if sys.platform == "win32":
+    import msvcrt
+else:
     import fcntl
-except ImportError:  # Windows: there is no lock there
-    fcntl = None  # type: ignore[assignment]
 
+FAR = 1 << 30
+"""The byte that is locked on Windows: others read no byte that is, and do read the text."""
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 """What file systems without locks answer; work goes on there as if nobody else worked."""
 
@@ -51,7 +54,7 @@ class FolderLock:
         """Opens and locks the file; again where another process removed it in between."""
         while True:
             try:
-                self._handle = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+                self._handle = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o644)
             except OSError as error:
                 raise self._unwritable(error) from error
             self._lock()
@@ -61,10 +64,12 @@ class FolderLock:
             self.close()
 
     def _lock(self) -> None:
-        if fcntl is None:
-            return
         try:
-            fcntl.lockf(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if sys.platform == "win32":
+                os.lseek(self._handle, FAR, os.SEEK_SET)
+                msvcrt.locking(self._handle, msvcrt.LK_NBLCK, 1)
+            else:
+                fcntl.lockf(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             if error.errno not in NO_LOCKS:
                 raise
@@ -73,7 +78,8 @@ class FolderLock:
         """Writes the process and the URL of its viewer into the file."""
         said = json.dumps({"process": os.getpid(), "url": url}).encode()
         os.ftruncate(self._handle, 0)
-        os.pwrite(self._handle, said, 0)
+        os.lseek(self._handle, 0, os.SEEK_SET)
+        os.write(self._handle, said)
 
     def _other(self) -> str:
         with suppress(OSError, ValueError, LookupError, TypeError):
@@ -90,8 +96,8 @@ class FolderLock:
 
     def remove(self) -> None:
         """Removes the file and releases the lock; the file's folder goes too if it is empty."""
-        if fcntl is None:
-            self.close()  # Windows removes no open files
+        if sys.platform == "win32":
+            self.close()  # it removes no open files
         with suppress(OSError):
             self.path.unlink()
             self.path.parent.rmdir()

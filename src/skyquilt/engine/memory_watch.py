@@ -15,10 +15,8 @@ from pathlib import Path
 from skyquilt.errors import SkyquiltError
 from skyquilt.settings import within
 
-try:
+if sys.platform != "win32":
     import resource
-except ImportError:  # Windows: there is no such limit
-    resource = None  # type: ignore[assignment]
 
 CHECK_S = 0.25
 """Time in s between checks."""
@@ -37,9 +35,10 @@ _CGROUPS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_
 
 def resident_bytes() -> int:
     """Resident memory of this process; 0 on systems that do not report it."""
-    with suppress(OSError, ValueError, IndexError):
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
-        return pages * os.sysconf("SC_PAGE_SIZE")
+    if sys.platform == "linux":
+        with suppress(OSError, ValueError, IndexError):
+            pages = int(Path("/proc/self/statm").read_text("ascii").split()[1])
+            return pages * os.sysconf("SC_PAGE_SIZE")
     return 0
 
 
@@ -47,12 +46,13 @@ def machine_bytes() -> int:
     """Memory of the machine, or of the container in which this process runs; 0 where it is not
     known.
     """
-    found = []
-    with suppress(OSError, ValueError, AttributeError):
-        found.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    found = list[int]()
+    if sys.platform != "win32":
+        with suppress(OSError, ValueError):
+            found.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
     for name in _CGROUPS:
         with suppress(OSError, ValueError):
-            found.append(int(Path(name).read_text()))
+            found.append(int(Path(name).read_text("ascii")))
     return min(found, default=0)
 
 
@@ -72,7 +72,7 @@ def enough_addresses(threads: int) -> None:
     Raises:
         SkyquiltError: it is too low for so many threads.
     """
-    if resource is None:
+    if sys.platform == "win32":  # there is no such limit
         return
     most, needed = resource.getrlimit(resource.RLIMIT_AS)[0], ADDRESSES_MB + THREAD_MB * threads
     if most != resource.RLIM_INFINITY and most < needed * 1e6:

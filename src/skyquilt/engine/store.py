@@ -24,7 +24,7 @@ from skyquilt.engine.constants import constants_of
 from skyquilt.engine.folder import refusal
 from skyquilt.engine.kept import Keep
 from skyquilt.engine.workers import HERE, Workers
-from skyquilt.outside import open_regular
+from skyquilt.outside import open_regular, put_in_place
 
 T = TypeVar("T")
 
@@ -236,7 +236,7 @@ class Store:
             path.parent.mkdir(parents=True, exist_ok=True)
             with partial.open("wb") as file:
                 write(file, value)
-            partial.replace(path)
+            put_in_place(partial, path)
         except OSError as error:
             with suppress(OSError):
                 partial.unlink(missing_ok=True)

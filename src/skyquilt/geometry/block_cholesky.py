@@ -10,8 +10,8 @@ and n^2. Unknowns that are coupled with all others, the *border* (cameras), are 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from io import BufferedRandom
 from tempfile import TemporaryFile
+from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -254,7 +254,7 @@ class _Parts:
         sizes = [8 * e * (e + c) for e, c in self._shapes]
         self._starts = np.cumsum([0, *sizes]).tolist()
         self._held = list[tuple[Array, Array]]()
-        self._file: BufferedRandom | None = None
+        self._file: IO[bytes] | None = None
         self._read = np.empty(0)
         if self._starts[-1] > HELD:
             with suppress(OSError):  # no folder for it that may be written

@@ -3,6 +3,7 @@
 import mmap
 import os
 import pickle
+import sys
 from tempfile import TemporaryFile
 from typing import Any, Generic, TypeVar
 
@@ -67,5 +68,5 @@ class InFile:
 
     def release(self) -> None:
         """Gives the memory of what was used back; what is used again is read again."""
-        if self._map is not None and hasattr(mmap, "MADV_DONTNEED"):
+        if sys.platform != "win32" and self._map is not None:
             self._map.madvise(mmap.MADV_DONTNEED)

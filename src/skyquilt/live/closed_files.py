@@ -5,8 +5,10 @@ Linux only; on other systems nothing is reported.
 import ctypes
 import os
 import struct
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from skyquilt.outside import is_folder, walk
 
@@ -23,11 +25,14 @@ class ClosedFiles:
     """The folder that is watched."""
     told: bool = False
     """Whether this system reports closed files."""
+    _libc: Any = None
     _handle: int = -1
     _lost: bool = False
     _folders: dict[int, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if sys.platform != "linux":
+            return
         try:
             self._libc = ctypes.CDLL(None, use_errno=True)
             self._handle = self._libc.inotify_init1(os.O_NONBLOCK | os.O_CLOEXEC)

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from skyquilt.errors import OutputError, UnreadablePhotoError
 from skyquilt.live.ledger import Ledger, hit
+from skyquilt.outside import put_in_place
 from skyquilt.photos.headers import HEAD_BYTES, kind_of
 from skyquilt.video.read import CLIP_ENDINGS
 from skyquilt.video.tracks import TRACK_ENDINGS
@@ -108,7 +109,7 @@ class Inbox:
             hit("photo file synced")
             path = self.folder / (digest.hexdigest() + ending)
             anew = _size(path) != size
-            partial.replace(path)
+            put_in_place(partial, path)
             synced(self.folder)
             hit("photo file named")
         except OSError as error:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from skyquilt.errors import OutputError
 from skyquilt.live.inbox import SEEN, is_clip, synced
 from skyquilt.live.photo_intake import Accepted, Intake, Refused, shown_name
-from skyquilt.outside import open_regular, read_bounded
+from skyquilt.outside import open_regular, put_in_place, read_bounded
 from skyquilt.video.container import is_video
 from skyquilt.video.tracks import TRACK_ENDINGS
 
@@ -66,7 +66,7 @@ def bring_clip(intake: Intake, file: Path, name: str, source: str) -> Waiting | 
         home.mkdir(parents=True, exist_ok=True)
         if is_clip(path):
             _record(home / _ABOUT, {"name": name, "source": source})
-        file.replace(home / f"clip{path.suffix.lower()}")
+        put_in_place(file, home / f"clip{path.suffix.lower()}")
         synced(home)
         synced(folder)
     except OSError as error:
@@ -170,8 +170,8 @@ def _about(home: Path) -> dict[str, str]:
 
 def _record(path: Path, said: dict[str, str]) -> None:
     partial = path.with_suffix(".new")
-    with partial.open("w") as file:
+    with partial.open("w", encoding="utf-8") as file:
         json.dump(said, file)
         file.flush()
         os.fsync(file.fileno())
-    partial.replace(path)
+    put_in_place(partial, path)

@@ -120,7 +120,7 @@ class ReadFiles:
 
     def __init__(self, store: Store) -> None:
         """What an earlier run read is taken from its store."""
-        tables = (files("skyquilt.photos").joinpath(name).read_text() for name in TABLES)
+        tables = (files("skyquilt.photos").joinpath(name).read_text("utf-8") for name in TABLES)
         self._key = digest(read_photo, [f.name for f in fields(Photo)], *tables, __version__)
         self._held: dict[str, dict[str, Any]] = dict(store.get(RECORDS, self._key) or {})
         self._read: dict[str, dict[str, Any]] = {}

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from skyquilt.errors import OutputError
+from skyquilt.outside import put_in_place
 
 CHUNK = 1 << 20
 
@@ -28,7 +29,7 @@ def whole_file(path: Path, *, needed: int = 0) -> Iterator[BinaryIO]:
         try:
             with partial.open("wb", buffering=CHUNK) as file:
                 yield file
-            partial.replace(path)
+            put_in_place(partial, path)
         except BaseException:
             with suppress(OSError):
                 partial.unlink()

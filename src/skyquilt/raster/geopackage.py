@@ -14,6 +14,7 @@ from shapely import to_wkb
 from shapely.geometry import LineString, Polygon
 
 from skyquilt.errors import OutputError
+from skyquilt.outside import put_in_place
 
 APPLICATION_ID, USER_VERSION = 0x47504B47, 10300
 """`GPKG`, version 1.3."""
@@ -78,7 +79,7 @@ def _write(path: Path, table: _Table, rows: list[tuple[Any, Any]], crs: str | No
     try:
         with closing(sqlite3.connect(partial)) as base, base:
             _fill(base, table, rows, crs)
-        partial.replace(path)
+        put_in_place(partial, path)
     except (OSError, sqlite3.Error) as error:
         partial.unlink(missing_ok=True)
         raise OutputError(f"{path} cannot be written: {error}") from error

@@ -10,6 +10,7 @@ from markupsafe import Markup
 
 from skyquilt.engine.folder import FILES
 from skyquilt.errors import OutputError
+from skyquilt.outside import put_in_place
 from skyquilt.report import headline
 from skyquilt.report.about import facts_of, photos_section
 from skyquilt.report.attention import attention
@@ -85,7 +86,7 @@ def write_page(path: Path, page: str) -> None:
     partial = path.with_name(path.name + ".partial")
     try:
         partial.write_text(page, encoding="utf-8")
-        partial.replace(path)
+        put_in_place(partial, path)
     except OSError as error:
         with suppress(OSError):
             partial.unlink()

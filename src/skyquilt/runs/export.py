@@ -15,7 +15,7 @@ import numpy as np
 
 from skyquilt.engine.folder import EXPORTS, changed, make_folder
 from skyquilt.errors import SideFileError, UsageError
-from skyquilt.outside import plain, read_bounded
+from skyquilt.outside import plain, put_in_place, read_bounded
 from skyquilt.raster import CogWriter, RasterSpec
 from skyquilt.raster.atomic import mended, write_text
 from skyquilt.raster.geopackage import write_polygons
@@ -244,9 +244,9 @@ def _tiles(
             "maxzoom": tiles.zooms[1],
             "bounds": list(tiles.degrees),
         }
-        (partial / "tiles.json").write_text(json.dumps(about, indent=1))
+        (partial / "tiles.json").write_text(json.dumps(about, indent=1), "utf-8")
         shutil.rmtree(folder, ignore_errors=True)
-        partial.replace(folder)
+        put_in_place(partial, folder)
     return folder
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.outside import put_in_place
 from skyquilt.raster.atomic import mended
 from skyquilt.raster.map_source import MERCATOR, Bounds, FileSource, between, mercator, picture
 from skyquilt.raster.mbtiles import touched, write_mbtiles
@@ -107,4 +108,4 @@ def write_mbtiles_file(
             if len(made) >= AT_ONCE:
                 write()
         write()
-        partial.replace(path)
+        put_in_place(partial, path)

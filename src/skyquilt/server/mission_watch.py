@@ -3,6 +3,7 @@ wait for it.
 """
 
 import os
+import sys
 import threading
 import time
 from contextlib import suppress
@@ -51,8 +52,9 @@ class MissionWatch:
         self._thread.join(10)
 
     def _run(self) -> None:
-        with suppress(OSError, AttributeError):  # on Linux a thread has its own niceness
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
+        if sys.platform == "linux":  # only there a thread has its own niceness
+            with suppress(OSError):
+                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
         ledger = Ledger(self.folder, write=True)
         try:
             while not self._stop.wait(PAUSE_S):

@@ -198,9 +198,14 @@ class PlanEndpoints:
         """Starts the computation and tells its end as an event."""
         code = "from skyquilt.cli.main import run; run()"
         command = [sys.executable, "-c", code, "plan", *words, "--quiet"]
-        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+        environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONIOENCODING": "utf-8"}
         process = subprocess.Popen(
-            command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=environment
+            command,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            encoding="utf-8",
+            errors="replace",
+            env=environment,
         )
         self._running = process
         ledger_folder = self.folder

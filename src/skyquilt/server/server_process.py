@@ -150,17 +150,20 @@ class ServerProcess:
 
 def _end_with_parent(parent: int) -> None:
     """On Linux, the system ends this process when the one that started it is killed."""
-    with suppress(OSError, AttributeError, TypeError):
-        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+    if sys.platform == "linux":
+        with suppress(OSError, AttributeError):
+            ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
     if os.getppid() != parent:
         os._exit(0)
 
 
 def _more_files() -> None:
     """As many open files as the system allows, since each connection is one."""
-    with suppress(ImportError, ValueError, OSError):
-        import resource
+    if sys.platform == "win32":  # it sets no such limit
+        return
+    import resource
 
+    with suppress(ValueError, OSError):
         soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
         resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, min(hard, 8192)), hard))
 
@@ -182,8 +185,9 @@ def _serve(
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl+C
     _end_with_parent(asked.parent)
     _more_files()
-    with suppress(OSError, AttributeError):
-        os.nice(NICE)
+    if sys.platform != "win32":
+        with suppress(OSError):
+            os.nice(NICE)
     try:
         survey = LiveSurvey(asked.folder, base=asked.base)
         door = UploadEndpoint(asked.folder, asked.settings)

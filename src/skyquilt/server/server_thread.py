@@ -2,6 +2,7 @@
 
 import errno
 import socket
+import sys
 import threading
 import time
 from dataclasses import dataclass, field
@@ -30,7 +31,11 @@ def bound(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     # TCP given explicitly, so that responses are sent at once (no delay by Nagle's algorithm)
     listening = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
-    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    # the option of the same name lets two programs listen on one port of Windows
+    if sys.platform == "win32":
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_EXCLUSIVEADDRUSE, 1)
+    else:
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     until = time.monotonic() + RETRY_S
     while True:
         try:

@@ -11,6 +11,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
+from skyquilt.outside import put_in_place
 from skyquilt.server.access import Guard
 
 SWEEP_S = 60.0
@@ -179,7 +180,7 @@ class Uploads:
         path = self.folder / f"{upload.id}.json"
         partial = path.with_suffix(".new")
         partial.write_text(json.dumps(asdict(upload)), encoding="utf-8")
-        partial.replace(path)
+        put_in_place(partial, path)
 
 
 def _changed(path: Path) -> float:

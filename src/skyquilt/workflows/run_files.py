@@ -234,11 +234,11 @@ def source_commit() -> str | None:
         head = folder / ".git" / "HEAD"
         if head.is_file():
             try:
-                text = head.read_text().strip()
+                text = head.read_text("utf-8").strip()
                 if not text.startswith("ref: "):
                     return text
                 ref = folder / ".git" / text.removeprefix("ref: ")
-                return ref.read_text().strip() if ref.is_file() else None
+                return ref.read_text("utf-8").strip() if ref.is_file() else None
             except OSError:
                 return None
     return None
