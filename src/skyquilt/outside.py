@@ -9,6 +9,7 @@ import errno
 import math
 import os
 import re
+import shutil
 import sqlite3
 import stat
 import sys
@@ -132,6 +133,18 @@ def put_in_place(partial: Path, path: Path) -> None:
         except PermissionError:
             if sys.platform != "win32" or time.monotonic() > until:
                 raise
+        time.sleep(0.02)
+
+
+def remove_folder(path: Path) -> None:
+    """Removes a folder with all that is in it, as far as the system lets it; one that is not there
+    is no error. On Windows, files that another program reads are waited for as in `put_in_place`.
+    """
+    until = time.monotonic() + BUSY_S
+    while True:
+        shutil.rmtree(path, ignore_errors=True)
+        if sys.platform != "win32" or not path.exists() or time.monotonic() > until:
+            return
         time.sleep(0.02)
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from skyquilt.engine import error_log
 from skyquilt.engine.lock import FolderLock
 from skyquilt.errors import OutputError
-from skyquilt.outside import open_regular, plain, put_in_place, read_bounded
+from skyquilt.outside import open_regular, plain, put_in_place, read_bounded, remove_folder
 from skyquilt.version import __version__
 
 CONTRACT = (
@@ -191,7 +191,7 @@ def open_run(
         (path / STATE).mkdir(parents=True, exist_ok=True)
         lock = FolderLock(path, f"{STATE}/{LOCK}", "run")
         if taken and grows:
-            shutil.rmtree(path / EXPORTS, ignore_errors=True)
+            remove_folder(path / EXPORTS)
         elif taken:
             _remove_files(path)
         probe = path / STATE / "probe"
@@ -228,7 +228,7 @@ def remove_run(path: Path) -> None:
 def _remove_files(path: Path) -> None:
     for name in (*CONTRACT, *FILES, error_log.NAME):  # none may stay beside another map
         (path / name).unlink(missing_ok=True)
-    shutil.rmtree(path / EXPORTS, ignore_errors=True)  # of the map that is replaced
+    remove_folder(path / EXPORTS)  # of the map that is replaced
 
 
 def _other(was: _Known) -> str:

@@ -15,9 +15,6 @@ from pathlib import Path
 from skyquilt.errors import SkyquiltError
 from skyquilt.settings import within
 
-if sys.platform != "win32":
-    import resource
-
 CHECK_S = 0.25
 """Time in s between checks."""
 SHARE = 0.9
@@ -74,6 +71,8 @@ def enough_addresses(threads: int) -> None:
     """
     if sys.platform == "win32":  # there is no such limit
         return
+    import resource
+
     most, needed = resource.getrlimit(resource.RLIMIT_AS)[0], ADDRESSES_MB + THREAD_MB * threads
     if most != resource.RLIM_INFINITY and most < needed * 1e6:
         fewer = ", or use fewer threads (--jobs)" if threads > 1 else ""

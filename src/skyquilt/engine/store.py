@@ -7,7 +7,6 @@ import hashlib
 import json
 import os
 import platform
-import shutil
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -24,7 +23,7 @@ from skyquilt.engine.constants import constants_of
 from skyquilt.engine.folder import refusal
 from skyquilt.engine.kept import Keep
 from skyquilt.engine.workers import HERE, Workers
-from skyquilt.outside import open_regular, put_in_place
+from skyquilt.outside import open_regular, put_in_place, remove_folder
 
 T = TypeVar("T")
 
@@ -269,4 +268,4 @@ class Store:
     def forget(self, stages: Sequence[str]) -> None:
         """Removes all results of these stages."""
         for stage in stages:
-            shutil.rmtree(self.folder / stage, ignore_errors=True)
+            remove_folder(self.folder / stage)

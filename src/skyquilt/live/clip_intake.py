@@ -21,6 +21,7 @@ from skyquilt.photos.frame_files import frame_jpeg
 from skyquilt.photos.pixels import read_color
 from skyquilt.photos.read import rejected
 from skyquilt.settings import InputSettings
+from skyquilt.video.decoder import close_clip
 from skyquilt.video.read import read_clip
 from skyquilt.workflows.artefacts import REGISTRY
 from skyquilt.workflows.clip_frames import with_frames
@@ -69,6 +70,8 @@ def take_clip(intake: Intake, path: Path, source: str, name: str = "") -> Taking
             raise system from error
         log_error(intake.ledger.path.parent, name, error)
         yield intake.refuse(name, source, rejected(name, error).reason)
+    finally:
+        close_clip(path)
 
 
 def _looked(path: Path, name: str, intake: Intake) -> Generator[None, None, SurveyInput]:

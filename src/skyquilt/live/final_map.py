@@ -13,7 +13,7 @@ from skyquilt.live.ledger import Ledger
 from skyquilt.live.live_map import FINISHED, PHOTOS
 from skyquilt.live.settings import LiveSettings
 from skyquilt.model.event import Event, Note
-from skyquilt.outside import is_file
+from skyquilt.outside import is_file, remove_folder
 from skyquilt.photos.side_rows import sentence_of
 from skyquilt.settings import MosaicSettings
 from skyquilt.workflows.mosaic import iter_mosaic
@@ -69,7 +69,7 @@ def named(folder: Path, photos: list[tuple[int, str, str]]) -> tuple[list[Path],
     The link names are safe as file names and contain the names under which the photos were sent.
     """
     home = folder / NAMED
-    shutil.rmtree(home, ignore_errors=True)
+    remove_folder(home)
     home.mkdir()
     taken: set[str] = set()
     paths, lost = [], []

@@ -8,7 +8,6 @@ the sender and the name without its extension.
 import hashlib
 import json
 import os
-import shutil
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -18,7 +17,7 @@ from typing import TYPE_CHECKING
 from skyquilt.errors import OutputError
 from skyquilt.live.inbox import SEEN, is_clip, synced
 from skyquilt.live.photo_intake import Accepted, Intake, Refused, shown_name
-from skyquilt.outside import open_regular, put_in_place, read_bounded
+from skyquilt.outside import open_regular, put_in_place, read_bounded, remove_folder
 from skyquilt.video.container import is_video
 from skyquilt.video.tracks import TRACK_ENDINGS
 
@@ -107,7 +106,7 @@ class UploadedClips:
             self.growing[home] = taking
             if whole:
                 del self.growing[home]
-                shutil.rmtree(home, ignore_errors=True)
+                remove_folder(home)
             yield from found
             return
 
@@ -117,7 +116,7 @@ class UploadedClips:
             if _clip_in(home) is not None:
                 self.growing.setdefault(home, None)
             elif _age(home) > KEEP_S:
-                shutil.rmtree(home, ignore_errors=True)
+                remove_folder(home)
         for gone in self.growing.keys() - set(homes):
             del self.growing[gone]
 

@@ -6,14 +6,13 @@ work was finished. After a kill, everything behind the last complete record is c
 """
 
 import os
-import shutil
 import struct
 import threading
 import zlib
 from pathlib import Path
 from typing import IO
 
-from skyquilt.outside import open_regular
+from skyquilt.outside import open_regular, remove_folder
 from skyquilt.raster.atomic import CHUNK, mended
 
 _HEAD = struct.Struct("<IIQ")
@@ -81,7 +80,7 @@ class Spool:
             except OSError:  # bytes that could not be flushed were never committed
                 continue
         if remove:
-            shutil.rmtree(self.folder, ignore_errors=True)
+            remove_folder(self.folder)
 
 
 def _cut(file: IO[bytes], end: int) -> None:

@@ -5,7 +5,6 @@ Each is computed block by block from the files of the run, so memory stays bound
 
 import json
 import math
-import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +14,7 @@ import numpy as np
 
 from skyquilt.engine.folder import EXPORTS, changed, make_folder
 from skyquilt.errors import SideFileError, UsageError
-from skyquilt.outside import plain, put_in_place, read_bounded
+from skyquilt.outside import plain, put_in_place, read_bounded, remove_folder
 from skyquilt.raster import CogWriter, RasterSpec
 from skyquilt.raster.atomic import mended, write_text
 from skyquilt.raster.geopackage import write_polygons
@@ -228,7 +227,7 @@ def _tiles(
     folder = target / f"{layer.name}-tiles"
     partial = target / f"{layer.name}-tiles.partial"
     with mended(folder):
-        shutil.rmtree(partial, ignore_errors=True)
+        remove_folder(partial)
         partial.mkdir()
         tiles = web_tiles(source, grid, scale, layer)
         for z, x, y, rgba in tiles:
@@ -245,7 +244,7 @@ def _tiles(
             "bounds": list(tiles.degrees),
         }
         (partial / "tiles.json").write_text(json.dumps(about, indent=1), "utf-8")
-        shutil.rmtree(folder, ignore_errors=True)
+        remove_folder(folder)
         put_in_place(partial, folder)
     return folder
 

@@ -125,6 +125,18 @@ def _decoder(path: Path) -> tuple[Decoder, threading.Lock]:
         return _decoders[path]
 
 
+def close_clip(path: Path) -> None:
+    """Closes the decoder of a clip of which no frame is asked for soon: Windows lets nobody remove
+    a clip before.
+    """
+    with _guard:
+        found = _decoders.pop(path, None)
+    if found is not None:
+        decoder, lock = found
+        with lock:
+            decoder.close()
+
+
 def frame_of(path: Path, time_s: float) -> Frame:
     """Pixels (height, width, 3) RGB of the frame of a clip at a time in s.
 

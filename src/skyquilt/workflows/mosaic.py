@@ -8,7 +8,6 @@ Start reading at `make_map`. Its steps are those of `skyquilt.workflows.flow`.
 """
 
 import json
-import shutil
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,7 +30,7 @@ from skyquilt.model.photo import RejectedPhoto
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.orthomosaic import SPOOL
 from skyquilt.ortho.radiometry import value_figures
-from skyquilt.outside import read_bounded
+from skyquilt.outside import read_bounded, remove_folder
 from skyquilt.photos.headers import content_digest
 from skyquilt.photos.read import ReadFiles
 from skyquilt.quality.clip_figures import clip_figures
@@ -418,7 +417,7 @@ def _forget(run: RunFolder, store: Store, rerun_from: str | None) -> None:
         later = STAGES[STAGES.index(rerun_from) :]
         store.forget([ADJUSTING, *(ARTEFACTS[s] for s in later if s in ARTEFACTS)])
         if "mosaic" in later:
-            shutil.rmtree(run.path / STATE / SPOOL, ignore_errors=True)
+            remove_folder(run.path / STATE / SPOOL)
         run.mark("running")
 
 
