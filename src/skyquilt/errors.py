@@ -1,5 +1,10 @@
 """Errors that a user can correct: each says what was found, what was expected, and what to do."""
 
+import sys
+
+PIP = r".venv\Scripts\pip" if sys.platform == "win32" else ".venv/bin/pip"
+"""What installs packages beside the program, in the folder of its source."""
+
 
 class SkyquiltError(Exception):
     """Base of all errors that a user can correct; `exit_code` is the exit code of the command."""

@@ -34,6 +34,8 @@ MOST_VALUE_BYTES = 256_000_000
 """Largest value of a row: a layer as text has some 100 MB."""
 MOST_QUERY_S = 60.0
 """CPU time after which a query is given up."""
+ACCESS_DENIED, SHARING_VIOLATION = 5, 32
+"""Windows's numbers of errors (`winerror`) for a file that is open elsewhere."""
 BUSY_S = 3.0
 """Time in s for which a file that another program reads is waited for."""
 MOST_ASPECT = 20
@@ -120,31 +122,47 @@ def _at_once(path: str, flags: int) -> int:
     return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
+def in_use(error: OSError) -> bool:
+    """Whether a system refused to change a file because a program may have it open: Windows says
+    the same where a file is read-only.
+    """
+    return getattr(error, "winerror", None) in (ACCESS_DENIED, SHARING_VIOLATION)
+
+
 def put_in_place(partial: Path, path: Path) -> None:
-    """Gives a complete file or folder its name, in place of the file that had it. Windows refuses
-    that while another program reads one of them, as viewers and virus scanners do for a moment: it
-    is tried again for a short time.
+    """Gives a complete file or folder its name, in place of the file that had it. Raises `OSError`
+    where the system refuses that.
+    """
+    _unless_read(lambda: partial.replace(path))
+
+
+def remove_file(path: Path) -> None:
+    """Removes a file; one that is not there is no error. Raises `OSError` where the system refuses
+    that.
+    """
+    _unless_read(lambda: path.unlink(missing_ok=True))
+
+
+def remove_folder(path: Path) -> None:
+    """Removes a folder with all that is in it; what the system refuses to remove stays."""
+    try:
+        _unless_read(lambda: shutil.rmtree(path))
+    except OSError:
+        shutil.rmtree(path, ignore_errors=True)
+
+
+def _unless_read(change: Callable[[], object]) -> None:
+    """Makes a change that Windows refuses while another program reads the file, as viewers and
+    virus scanners do for a moment: there it is tried again for a short time.
     """
     until = time.monotonic() + BUSY_S
     while True:
         try:
-            partial.replace(path)
+            change()
             return
         except PermissionError:
             if sys.platform != "win32" or time.monotonic() > until:
                 raise
-        time.sleep(0.02)
-
-
-def remove_folder(path: Path) -> None:
-    """Removes a folder with all that is in it, as far as the system lets it; one that is not there
-    is no error. On Windows, files that another program reads are waited for as in `put_in_place`.
-    """
-    until = time.monotonic() + BUSY_S
-    while True:
-        shutil.rmtree(path, ignore_errors=True)
-        if sys.platform != "win32" or not path.exists() or time.monotonic() > until:
-            return
         time.sleep(0.02)
 
 

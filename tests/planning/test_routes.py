@@ -262,5 +262,5 @@ def test_without_or_tools_a_sentence_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "ortools", None)
     monkeypatch.setitem(sys.modules, "ortools.constraint_solver", None)
     site = make_site(box(0, 0, 90, 90), (), ZONE)
-    with pytest.raises(UsageError, match=r"pip install .*'\.\[plan\]'"):
+    with pytest.raises(UsageError, match=r'pip install .*"\.\[plan\]"'):
         plan_routes(site, grid(3, 3), fleet(1), QUICK, FLAT, 60.0)

@@ -16,6 +16,7 @@ import builtins
 import ctypes
 import errno
 import importlib.util
+import mimetypes
 import mmap
 import os
 import re
@@ -234,10 +235,9 @@ def look(event: str, given: tuple[Any, ...]) -> None:
     elif event == "os.rename":
         old, new = within(given[0], given[2]), within(given[1], given[3])
         checked(new)
-        for text in (old, new):
-            if held(text):
-                refuse(OPEN, text)
-        if os.path.isdir(new):
+        if held(old):
+            refuse(OPEN, old)
+        if held(new) or os.path.isdir(new):
             refuse(DENIED, new)
 
 
@@ -277,4 +277,5 @@ if _told:
     builtins.__import__ = imported
     warnings.filterwarnings("ignore", category=EncodingWarning)
     warnings.filterwarnings("error", category=EncodingWarning, module=r"skyquilt\b")
+    mimetypes.add_type("text/plain", ".js")  # as some programs write into the registry
     sys.addaudithook(hook)

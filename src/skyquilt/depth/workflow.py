@@ -40,6 +40,7 @@ from skyquilt.engine.workers import Threads
 from skyquilt.errors import PhotoFailedError, RefusedError, UsageError
 from skyquilt.model.event import Event, Note, Result
 from skyquilt.model.surface import Surface
+from skyquilt.outside import remove_file
 from skyquilt.raster.atomic import write_text
 from skyquilt.settings import MosaicSettings, within
 from skyquilt.typed import as_path, instance
@@ -100,7 +101,7 @@ def iter_depth(
     former = former_fields(output)
     with claimed(output, FILES, overwrite=overwrite):
         for path in former:
-            path.unlink(missing_ok=True)
+            remove_file(path)
         clock = Clock(
             store=Store(folder=output / STATE / "store", registry=REGISTRY),
             began=began,

@@ -13,7 +13,15 @@ from pathlib import Path
 from skyquilt.engine import error_log
 from skyquilt.engine.lock import FolderLock
 from skyquilt.errors import OutputError
-from skyquilt.outside import open_regular, plain, put_in_place, read_bounded, remove_folder
+from skyquilt.outside import (
+    in_use,
+    open_regular,
+    plain,
+    put_in_place,
+    read_bounded,
+    remove_file,
+    remove_folder,
+)
 from skyquilt.version import __version__
 
 CONTRACT = (
@@ -227,7 +235,7 @@ def remove_run(path: Path) -> None:
 
 def _remove_files(path: Path) -> None:
     for name in (*CONTRACT, *FILES, error_log.NAME):  # none may stay beside another map
-        (path / name).unlink(missing_ok=True)
+        remove_file(path / name)
     remove_folder(path / EXPORTS)  # of the map that is replaced
 
 
@@ -261,7 +269,7 @@ def claimed(path: Path, names: Sequence[str], *, overwrite: bool) -> Iterator[No
         try:
             _refuse_files(path, overwrite)  # of a run that ended just now
             for name in names:
-                (path / name).unlink(missing_ok=True)
+                remove_file(path / name)
             probe = path / ".probe"
             probe.write_bytes(b"x")
             probe.unlink()
@@ -313,6 +321,7 @@ def refusal(path: Path, error: OSError) -> OutputError:
             f"the disk is full: cannot write to {path}. Make room and run the same command again to"
             " resume"
         )
+    also = "close programs that have files in it open, or " if in_use(error) else ""
     return OutputError(
-        f"cannot write to {path}: {error.strerror or error}; choose another output folder"
+        f"cannot write to {path}: {error.strerror or error}; {also}choose another output folder"
     )

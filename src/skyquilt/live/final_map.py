@@ -21,6 +21,9 @@ from skyquilt.workflows.mosaic import iter_mosaic
 NAMED = "named"
 """Folder with links to the photos under readable names, for the files of the final map."""
 
+RESERVED = {"con", "prn", "aux", "nul"} | {f"{p}{n}" for p in ("com", "lpt") for n in range(1, 10)}
+"""Names of devices of Windows, which no file can have there, whatever its ending."""
+
 
 def iter_finish(folder: Path, settings: LiveSettings) -> Iterator[Event]:
     """Makes the batch mosaic in `folder/finished`; the live map is not changed.
@@ -79,7 +82,7 @@ def named(folder: Path, photos: list[tuple[int, str, str]]) -> tuple[list[Path],
             continue
         stem = re.sub(r"[^A-Za-z0-9_-]", "_", Path(name).stem)[:80].strip("_") or "photo"
         plain = f"{stem}{Path(file).suffix}"
-        if plain.lower() in taken:
+        if plain.lower() in taken or stem.lower() in RESERVED:
             plain = f"{stem}-{number}{Path(file).suffix}"
         taken.add(plain.lower())
         target = home / plain

@@ -3,7 +3,6 @@
 import json
 import time
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 from skyquilt.engine.folder import make_folder
 from skyquilt.errors import OutputError, UsageError
 from skyquilt.model.event import Event, Result, StageFinished, StageProgress, StageStarted
+from skyquilt.outside import remove_file
 from skyquilt.papers.strip_chain import VARIANTS, calibrated, chained
 from skyquilt.papers.strip_page import strip_page
 from skyquilt.raster.atomic import write_text
@@ -75,8 +75,7 @@ def _make_room(output: Path, overwrite: bool) -> None:
                 " another folder"
             )
         for name in reversed(taken):
-            with suppress(FileNotFoundError):
-                (output / name).unlink()
+            remove_file(output / name)
     except OSError as error:
         raise OutputError(
             f"cannot write to {output}: {error.strerror or error}; choose another folder"

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from skyquilt.errors import UsageError
+from skyquilt.errors import PIP, UsageError
 from skyquilt.planning.records import Array
 
 UNIT = 100
@@ -54,7 +54,7 @@ def solver() -> Any:
     except ImportError:
         raise UsageError(
             "planning routes needs OR-tools, which is not installed; it is the extra `plan`:"
-            " .venv/bin/pip install -c constraints.txt '.[plan]' in the folder of the source"
+            f' {PIP} install -c constraints.txt ".[plan]" in the folder of the source'
         ) from None
     return pywrapcp
 

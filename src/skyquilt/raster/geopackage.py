@@ -14,7 +14,7 @@ from shapely import to_wkb
 from shapely.geometry import LineString, Polygon
 
 from skyquilt.errors import OutputError
-from skyquilt.outside import put_in_place
+from skyquilt.outside import put_in_place, remove_file
 
 APPLICATION_ID, USER_VERSION = 0x47504B47, 10300
 """`GPKG`, version 1.3."""
@@ -75,7 +75,7 @@ class _Table:
 
 def _write(path: Path, table: _Table, rows: list[tuple[Any, Any]], crs: str | None) -> int:
     partial = path.with_name(path.name + ".partial")
-    partial.unlink(missing_ok=True)
+    remove_file(partial)
     try:
         with closing(sqlite3.connect(partial)) as base, base:
             _fill(base, table, rows, crs)

@@ -14,7 +14,7 @@ import numpy as np
 
 from skyquilt.engine.folder import EXPORTS, changed, make_folder
 from skyquilt.errors import SideFileError, UsageError
-from skyquilt.outside import plain, put_in_place, read_bounded, remove_folder
+from skyquilt.outside import plain, put_in_place, read_bounded, remove_file, remove_folder
 from skyquilt.raster import CogWriter, RasterSpec
 from skyquilt.raster.atomic import mended, write_text
 from skyquilt.raster.geopackage import write_polygons
@@ -212,7 +212,7 @@ def write_tif(
                 pixels = np.where(shown[..., None], pixels, np.float32(np.nan))
             writer.write_block(block, np.ascontiguousarray(pixels), None if real else shown)
     if not some:
-        path.unlink(missing_ok=True)
+        remove_file(path)
     return some
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.errors import UsageError
+from skyquilt.errors import PIP, UsageError
 from skyquilt.raster.map_source import Bounds, FileSource
 from skyquilt.typed import as_kind
 
@@ -101,8 +101,8 @@ def as_xarray(raster: Raster, name: str, unit: str) -> "xarray.DataArray":
         import xarray
     except ImportError as error:
         raise UsageError(
-            "xarray is not installed; it is the extra `xarray`: .venv/bin/pip install -c"
-            " constraints.txt '.[xarray]'"
+            f"xarray is not installed; it is the extra `xarray`: {PIP} install -c constraints.txt"
+            ' ".[xarray]"'
         ) from error
     measured = raster.pixels.dtype.kind == "f"
     nothing = np.nan if measured else 0

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.outside import put_in_place
+from skyquilt.outside import put_in_place, remove_file
 from skyquilt.raster.atomic import mended
 from skyquilt.raster.map_source import MERCATOR, Bounds, FileSource, between, mercator, picture
 from skyquilt.raster.mbtiles import touched, write_mbtiles
@@ -96,7 +96,7 @@ def write_mbtiles_file(
     tiles = web_tiles(source, grid, scale, layer)
     partial = path.with_name(path.name + ".partial")
     with mended(path):
-        partial.unlink(missing_ok=True)
+        remove_file(partial)
         made: list[tuple[int, int, int, bytes | None]] = []
 
         def write() -> None:

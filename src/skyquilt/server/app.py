@@ -3,6 +3,7 @@ passes on what clients send; it does not compute poses.
 """
 
 import asyncio
+import mimetypes
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -31,6 +32,12 @@ from skyquilt.version import __version__
 
 if TYPE_CHECKING:
     from skyquilt.server.mission_watch import MissionWatch  # only for live surveys
+
+
+KINDS = {".css": "text/css", ".html": "text/html", ".js": "text/javascript"}
+"""Types of the page's files. The registry of Windows may give others, and browsers run no script
+that is said to be text.
+"""
 
 
 def _damaged(_: Request, error: Exception) -> Response:
@@ -127,6 +134,8 @@ def make_app(
     ):
         app.add_api_route(path, work, **options)
     app.add_exception_handler(SideFileError, _damaged)
+    for ending, kind in KINDS.items():
+        mimetypes.add_type(kind, ending)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     app.add_middleware(Packed)
     app.add_middleware(Guarded, guard=guard, log=None if writer is None else folder)

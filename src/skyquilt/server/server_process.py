@@ -123,10 +123,21 @@ class ServerProcess:
             if self._ending.wait(1.0):
                 return
             log_error(self.asked.folder, "the viewer's process ended and is started anew", "")
-            while (problem := self._start()) and not self._ending.is_set():
+            while (problem := self._again()) and not self._ending.is_set():
                 log_error(self.asked.folder, f"it does not start: {problem}", "")
                 if self._ending.wait(RESTART_S):
                     return
+
+    def _again(self) -> str:
+        """Starts another process; returns why it could not be started, empty if it runs."""
+        if sys.platform == "win32":
+            # a socket there stays with the completion port of the first process that waited on it
+            self._parts["socket"].close()
+            try:
+                self._parts["socket"] = bound(self.asked.guard.host, self.port)
+            except UsageError as error:
+                return str(error)
+        return self._start()
 
     def __exit__(
         self,

@@ -10,7 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from skyquilt.errors import UsageError
+from skyquilt.errors import PIP, UsageError
 from skyquilt.server.access import Guard
 from skyquilt.server.shown import Survey
 
@@ -18,7 +18,7 @@ RETRY_S = 2.0
 """If the port is in use, it is tried again for this time in s."""
 NEEDED = (
     "the live map and its viewer need the packages of the extra `live`; in the folder of the"
-    " source: make install, or .venv/bin/pip install -c constraints.txt '.[live]'"
+    f' source: make install, or {PIP} install -c constraints.txt ".[live]"'
 )
 
 
