@@ -1,5 +1,6 @@
 """Builds the wheel, installs it in a fresh environment of every Python from 3.11 on that this
-machine has, and uses it there: a simulated flight is mapped, and shown by `view` and `live`.
+machine has, and uses it there: a simulated flight is mapped, and shown by `view` and `live`. For
+Windows and macOS it only looks whether every package has a wheel.
 
 python .ci/wheels.py
 """
@@ -15,6 +16,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 LEAST, TRIED = (3, 11), range(11, 16)
+PLATFORMS, MINORS = ("win_amd64", "macosx_14_0_arm64"), (11, 12, 13)
 Version = tuple[int, int]
 
 
@@ -81,6 +83,18 @@ def used(python: Path, wheel: Path, folder: Path) -> str:
     return run(skyquilt, "--version").strip()
 
 
+def found(platform: str, minor: int, wheel: Path, folder: Path) -> None:
+    """Looks whether all that the wheel needs can be installed elsewhere without a compiler. What a
+    package needs on that system alone is not looked for: pip asks for this one.
+    """
+    run(
+        sys.executable, "-m", "pip", "--disable-pip-version-check", "install", "--quiet",
+        "--dry-run", "--ignore-installed", "--only-binary=:all:", "--platform", platform,
+        "--python-version", f"3.{minor}", "--target", folder / "nothing",
+        "--constraint", ROOT / "constraints.txt", f"{wheel}[live]",
+    )  # fmt: skip
+
+
 def main() -> None:
     """Prints a line for each version of Python."""
     there = pythons()
@@ -101,6 +115,10 @@ def main() -> None:
             sys.stdout.write(f"Python 3.{minor}: {said} installed; mosaic, view, live work\n")
             sys.stdout.flush()
             shutil.rmtree(place)
+        for platform in PLATFORMS:
+            for minor in MINORS:
+                found(platform, minor, wheel, folder)
+            sys.stdout.write(f"{platform}: wheels for Python 3.{MINORS[0]} to 3.{MINORS[-1]}\n")
 
 
 if __name__ == "__main__":

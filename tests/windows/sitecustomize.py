@@ -24,7 +24,6 @@ import signal
 import socket
 import sys
 import threading
-import traceback
 import warnings
 from collections.abc import Iterator
 from contextlib import suppress
@@ -62,9 +61,7 @@ def refuse(number: int, path: str) -> None:
     error = OSError(*kinds[number], path)
     error.winerror = number  # type: ignore[attr-defined]
     with suppress(OSError), open(_told, "a", encoding="utf-8") as notes:
-        stack = [s for s in traceback.extract_stack() if "skyquilt" in s.filename]
-        at = f"{Path(stack[-1].filename).name}:{stack[-1].lineno}" if stack else "?"
-        notes.write(f"{number} {path} {at}\n")
+        notes.write(f"{number} {path}\n")
     raise error
 
 
@@ -165,7 +162,10 @@ def processes() -> list[str]:
     found = []
     for number in os.listdir("/proc"):
         with suppress(OSError):
-            if number.isdigit() and f"{MARK}=".encode() in Path(f"/proc/{number}/environ").read_bytes():
+            if (
+                number.isdigit()
+                and f"{MARK}=".encode() in Path(f"/proc/{number}/environ").read_bytes()
+            ):
                 found.append(number)
     return found
 
