@@ -237,8 +237,10 @@ def unzipped(archive: "ZipFile", name: str, most: int) -> bytes:
 
 
 def same_folder(a: Path, b: Path) -> bool:
-    """Whether two paths lead to one place. Unlike `Path.resolve`, links in a circle do no harm."""
-    return os.path.realpath(a) == os.path.realpath(b)
+    """Whether two paths lead to one place, in large and small letters on Windows. Unlike
+    `Path.resolve`, links in a circle do no harm.
+    """
+    return os.path.normcase(os.path.realpath(a)) == os.path.normcase(os.path.realpath(b))
 
 
 PHOTO_ENDINGS = (".jpg", ".jpeg", ".jpe", ".jfif", ".tif", ".tiff", ".png")

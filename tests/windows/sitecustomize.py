@@ -22,6 +22,7 @@ import os
 import re
 import signal
 import socket
+import stat
 import sys
 import threading
 import warnings
@@ -60,7 +61,7 @@ def refuse(number: int, path: str) -> None:
     }
     error = OSError(*kinds[number], path)
     error.winerror = number  # type: ignore[attr-defined]
-    with suppress(OSError), open(_told, "a", encoding="utf-8") as notes:
+    with suppress(OSError), open(_told, "a", encoding="utf-8", errors="backslashreplace") as notes:
         notes.write(f"{number} {path}\n")
     raise error
 
@@ -176,7 +177,7 @@ def held(path: str) -> bool:
         file = os.lstat(path)
     except OSError:
         return False
-    folder = os.path.realpath(path) + "/" if os.path.isdir(path) else None
+    folder = os.path.realpath(path) + "/" if stat.S_ISDIR(file.st_mode) else None
     for number in processes():
         with suppress(OSError):
             for handle in os.listdir(f"/proc/{number}/fd"):

@@ -4,7 +4,6 @@ import errno
 import hashlib
 import json
 import os
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -226,7 +225,9 @@ def remove_run(path: Path) -> None:
     try:
         _remove_files(path)
         lock.close()
-        shutil.rmtree(path / STATE)
+        remove_folder(path / STATE)
+        if (path / STATE).exists():
+            raise OSError(errno.EACCES, os.strerror(errno.EACCES), str(path / STATE))
     except OSError as error:
         raise refusal(path, error) from error
     with suppress(OSError):  # it holds files of others

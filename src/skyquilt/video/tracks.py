@@ -6,7 +6,7 @@ import io
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -117,7 +117,8 @@ def _read_srt(path: Path) -> Track:
     moment = None if first is None else samples[first].moment
     start = None
     if first is not None and moment is not None:
-        start = datetime.fromtimestamp(_unix(moment) - timed[first], UTC).replace(tzinfo=None)
+        # not `fromtimestamp`: Windows knows no time before 1970, as of a clock that was never set
+        start = datetime(1970, 1, 1) + timedelta(seconds=_unix(moment) - timed[first])
     decimals = max((s.decimals for s in samples), default=0)
     focal = [s.focal_35mm for s in samples if s.focal_35mm]
     zoom = [s.zoom for s in samples if s.zoom]
