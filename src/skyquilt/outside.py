@@ -122,11 +122,16 @@ def _at_once(path: str, flags: int) -> int:
     return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
-def in_use(error: OSError) -> bool:
-    """Whether a system refused to change a file because a program may have it open: Windows says
-    the same where a file is read-only.
+def in_use(error: OSError, path: Path) -> str:
+    """The sentence where Windows refused to change a file because a program has it open, for which
+    it gives the same reason as where a file is read-only; empty for other errors.
     """
-    return getattr(error, "winerror", None) in (ACCESS_DENIED, SHARING_VIOLATION)
+    if getattr(error, "winerror", None) not in (ACCESS_DENIED, SHARING_VIOLATION):
+        return ""
+    return (
+        f"{path} cannot be written: another program has it open, or this user may not write there."
+        " Close that program, or choose another output folder."
+    )
 
 
 def put_in_place(partial: Path, path: Path) -> None:

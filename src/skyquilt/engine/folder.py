@@ -322,7 +322,8 @@ def refusal(path: Path, error: OSError) -> OutputError:
             f"the disk is full: cannot write to {path}. Make room and run the same command again to"
             " resume"
         )
-    also = "close programs that have files in it open, or " if in_use(error) else ""
+    if words := in_use(error, Path(error.filename or path)):
+        return OutputError(words)
     return OutputError(
-        f"cannot write to {path}: {error.strerror or error}; {also}choose another output folder"
+        f"cannot write to {path}: {error.strerror or error}; choose another output folder"
     )

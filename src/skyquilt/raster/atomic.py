@@ -66,11 +66,8 @@ def free_bytes(folder: Path) -> int:
 def _sentence(path: Path, error: OSError, needed: int) -> str:
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return _too_small(path, needed, free_bytes(path.parent))
-    if in_use(error):
-        return (
-            f"{path} cannot be written: another program has it open, or this user may not write to"
-            f" {path.parent}. Close that program, or choose another output folder."
-        )
+    if words := in_use(error, path):
+        return words
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         why = "is read-only" if error.errno == errno.EROFS else "may not be written by this user"
         return f"{path} cannot be written: {path.parent} {why}. Choose another output folder."
