@@ -150,6 +150,7 @@ class Reading:
                         continue
                     what = path.split("?")[0].split("/")[0], answer.status_code
                     self.answers[what] = self.answers.get(what, 0) + 1
+                    self.end.wait(0.03)
 
     def paths(self, web):
         try:
@@ -230,8 +231,9 @@ def test_a_live_map_is_shown_finished_and_goes_on_when_its_viewer_ends(windows, 
     with httpx.Client(base_url=url, timeout=60) as web, Reading(url) as reading:
         lossy = ("--loss", "0.3", "--rate", "10", "--quiet")
         windows.skyquilt("fly", flight / "flight", "--to", inbox, *lossy)
-        some = until(lambda: placed(web))
+        some = len(list(inbox.rglob("*.jpg")))
         assert 3 <= some < 6
+        until(lambda: placed(web) == some)
         assert web.post("finish").status_code == 200
         first = until(lambda: finished(out))
         # the photos that were lost, under the name of a device
