@@ -1,6 +1,7 @@
 """`skyquilt mosaic` with control points, in a process of its own, into a folder beside the run."""
 
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -83,7 +84,11 @@ class ControlRun:
                 return False
             with (self.folder / FOLDER / LOG).open("wb") as log:
                 self._process = subprocess.Popen(
-                    words, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
+                    words,
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=subprocess.STDOUT,
+                    env={**os.environ, "PYTHONIOENCODING": "utf-8"},  # as it is read
                 )
         return True
 
