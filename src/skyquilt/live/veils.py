@@ -26,10 +26,11 @@ from skyquilt.outside import whole
 
 KEY, NOTED = "veil ", "veils noted"
 """Names in the ledger of the veil of a photo, before its number, and of how many were noted."""
-SURE_SHARE = 0.1
-"""Share of a picture that the first one must surely show through a veil. More than on the map at
-the end: where photos are not well placed yet, what stands beside a place seems to veil it; of 75
-photos of `caliterra` up to 0.065.
+SURE_SHARE = 0.07
+"""Share of a picture that the first one must surely show through a veil, among photos that it is
+linked with. Where these are not well placed yet, what stands beside a place seems to veil it: of
+75 photos of `caliterra` up to 0.049, and 0.118 among those that are linked with these, too; over
+fires 0.064 and 0.087.
 """
 NEAREST = 20
 """Most photos that are compared."""
@@ -81,8 +82,17 @@ class LiveVeils:
         return [self.members.by_id[i] for i in new]
 
     def _found(self, member: Member) -> dict[int, Blank]:
-        """What is veiled in a photo and in those around it, by their numbers."""
-        alike = self._around(member)
+        """What is veiled in a photo and those around it, by their numbers: until there is a veil,
+        those that it is linked with.
+        """
+        if self._veils:
+            return self._veiled(self._around(member, rings=2), least=0.0)
+        return self._veiled(self._around(member, rings=1), least=SURE_SHARE)
+
+    def _veiled(self, alike: list[Member], least: float) -> dict[int, Blank]:
+        """What is veiled in some photos of one layer, by their numbers; `least` as in
+        `veiled_parts`.
+        """
         if len(alike) < FEWEST_VIEWS:
             return {}
         known = np.concatenate([m.pose.map_C[None, :2] for m in alike if m.pose is not None])
@@ -95,20 +105,22 @@ class LiveVeils:
             return {}
         outline = np.concatenate([v.footprint for v in views])
         xy = self.heights.places((*outline.min(0), *outline.max(0)))
-        xyz = np.column_stack([xy, np.full(len(xy), ground)])
+        z = self.heights.at(np.floor(xy / self.heights.cell).astype(np.int64))
+        xyz = np.column_stack([xy, z])
         thumbnails = {v.photo: self.live_links.thumbnail(v.photo) for v in views}
         marks = {m.id: self.live_links.marks.shown(m.photo.camera_key) for m in alike}
         fixed = {i: mark for i, mark in marks.items() if mark is not None}
         if not len(xyz):
             return {}
-        least = 0.0 if self._veils else SURE_SHARE
         return veiled_parts(views, xyz, thumbnails, fixed, least=least)
 
-    def _around(self, member: Member) -> list[Member]:
-        """A photo, those that it is linked with, and the nearest that are linked with these."""
-        known = self.members.by_id
-        near = {member.id, *member.links}
-        near |= {j for i in member.links for j in known[i].links}
+    def _around(self, member: Member, rings: int) -> list[Member]:
+        """A photo and the nearest that are linked with it, of two rings also those that are linked
+        with these.
+        """
+        known, near = self.members.by_id, {member.id}
+        for _ in range(rings):
+            near |= {j for i in near for j in known[i].links}
         alike = [
             m
             for i in sorted(near)

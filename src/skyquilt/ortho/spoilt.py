@@ -70,7 +70,7 @@ def spoilt_parts(
         notes += (overexposed_note([names[i] for i in white]),)
     spots, told = find_spots(alignment, thumbnails)
     notes += told
-    veiled = find_veiled(alignment, thumbnails, fixed)
+    veiled = find_veiled(alignment, thumbnails, fixed, {*white, *blurred})
     # what is overexposed or blurred has little contrast as well, and was told
     if unnamed := sorted(veiled.keys() - white.keys() - blurred.keys()):
         notes += (veiled_note([names[i] for i in unnamed]),)

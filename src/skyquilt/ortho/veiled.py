@@ -6,7 +6,7 @@ the logarithm of grey values differs less from its surroundings than in photos t
 ground clearly. Light and shade act as a factor and leave that contrast as it is.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import cv2
@@ -43,33 +43,38 @@ FEWEST_VIEWS = 3
 """Fewest photos that must show a place; the second clearest of them tells what it looks like."""
 TIED, NEAR = 3, 7
 """So many tie points must lie within so many squares a side: waves and glitter have none."""
-SURELY, SURE_SHARE = 0.5, 0.06
+SURELY, SURE_SHARE = 0.5, 0.05
 """There are veils where a part of a picture, at least such a share of it, lies so far below others
 in the logarithm of contrast, even where these show least around: a tree or a roof that leans over
-the ground in other photos has contrast, too, but not everywhere. Shares of clear photos reach 0.025
-(12 surveys); the largest of five flights over fires are 0.12 to 0.29.
+the ground in other photos has contrast, too, but not everywhere. Shares of clear photos reach 0.026
+(18 surveys); the largest of five flights over fires are 0.08 to 0.21.
 """
 VEILED, SHARE, PARTLY = 0.4, 0.02, 0.2
 """Then a part is veiled where it lies so far below, on such a share of the picture, and goes on
 where it lies so far below. Of clear parts nine tenths lie less than 0.3 below; a veil that takes
 six tenths of the light lies 0.6 to 1.6 below.
 """
+MARGIN = 0.2
+"""Width in footprints of the strip around a photo's in which its ground may lie."""
 KNOWN = 0.3
 """Known share of the cells around one that tells of it."""
 
 
 def find_veiled(
-    alignment: Alignment, thumbnails: Mapping[int, NDArray[Any]], fixed: Mapping[int, Blank]
+    alignment: Alignment,
+    thumbnails: Mapping[int, NDArray[Any]],
+    fixed: Mapping[int, Blank],
+    spoilt: Collection[int] = (),
 ) -> dict[int, Blank]:
     """What smoke, fog or haze veils, by photo (index), only of photos where something is.
     `thumbnails`: (h, w[, bands]) of the photos, of which those of 8 bits are judged; `fixed`: where
-    they show marks.
+    they show marks; `spoilt`: photos that lack contrast for another reason.
     """
     xyz = alignment.ties.xyz
     if not len(xyz):
         return {}
     views = make_views(alignment, level(float(np.median(xyz[:, 2]))))
-    return veiled_parts(views, xyz, thumbnails, fixed)
+    return veiled_parts(views, xyz, thumbnails, fixed, spoilt=spoilt)
 
 
 def veiled_note(names: Sequence[str]) -> str:
@@ -89,15 +94,16 @@ def veiled_parts(
     fixed: Mapping[int, Blank],
     *,
     least: float = SURE_SHARE,
+    spoilt: Collection[int] = (),
 ) -> dict[int, Blank]:
     """What is veiled in photos as seen from some views, by photo, only of photos where something
     is; `xyz`: tie points (n, 3) on their ground, at least one; `least`: share of a picture that
-    must surely be veiled, of one of them.
+    must surely be veiled, of one of them that is not `spoilt` anyway.
     """
     found = dict[int, Blank]()
     for group in _alike([v for v in views if thumbnails[v.photo].dtype == np.uint8]):
         if len(group) >= FEWEST_VIEWS:
-            found |= _veiled(group, xyz, thumbnails, fixed, least)
+            found |= _veiled(group, xyz, thumbnails, fixed, least, spoilt)
     return found
 
 
@@ -123,12 +129,17 @@ def _veiled(
     thumbnails: Mapping[int, NDArray[Any]],
     fixed: Mapping[int, Blank],
     least: float,
+    spoilt: Collection[int],
 ) -> dict[int, Blank]:
     """`veiled_parts` of photos of one camera and ground size."""
     seen = _Ground(views, xyz)
     looks = [seen.look(view, thumbnails[view.photo], fixed.get(view.photo)) for view in views]
-    usual = seen.least()
-    if not any(_large(b > SURELY, least).any() for b in _below(views, looks, usual)):
+    surely = (
+        _large(below > SURELY, least).any()
+        for view, below in zip(views, _below(views, looks, seen.least()), strict=True)
+        if view.photo not in spoilt
+    )
+    if not any(surely):
         return {}
     found = dict[int, Blank]()
     for view, below in zip(views, _below(views, looks, seen.clearest()), strict=True):
@@ -193,18 +204,27 @@ def _raster(cell: NDArray[Any], value: NDArray[Any], shape: tuple[int, int]) -> 
     """
     n = shape[0] * shape[1]
     count, total = (
-        cv2.blur(
-            np.bincount(cell, weight, n).reshape(shape).astype(np.float32),
-            (3, 3),
-            borderType=cv2.BORDER_CONSTANT,
-        )
-        for weight in (None, value)
+        _around(np.bincount(cell, weight, n).reshape(shape), 3) for weight in (None, value)
     )
-    return np.where(count > KNOWN, total / np.maximum(count, KNOWN), 0).astype(np.float32)
+    return np.where(count > 9 * KNOWN, total / np.maximum(count, 9 * KNOWN), 0).astype(np.float32)
+
+
+def _around(raster: NDArray[Any], side: int) -> Float:
+    """Sums (h, w) over the squares of a raster's cells around each, so many cells a side."""
+    return np.asarray(
+        cv2.boxFilter(
+            raster.astype(np.float32),
+            -1,
+            (side, side),
+            normalize=False,
+            borderType=cv2.BORDER_CONSTANT,
+        ),
+        np.float32,
+    )
 
 
 class _Ground:
-    """Points of level ground, and the contrast of the two photos that show each most clearly."""
+    """Points of the ground, and the contrast of the two photos that show each most clearly."""
 
     def __init__(self, views: Sequence[View], xyz: NDArray[Any]) -> None:
         outline = np.concatenate([v.footprint for v in views])
@@ -214,27 +234,28 @@ class _Ground:
         self._low = low
         columns, rows = (np.ceil((high - low) / self._step).astype(int) + 1).tolist()
         self._shape = rows, columns
-        self._z = float(np.median(xyz[:, 2]))
         self._two = np.full((2, rows * columns), -np.inf, np.float32)
         self._views = np.zeros(rows * columns, np.int32)
         at = np.rint((xyz[:, :2] - low) / self._step).astype(int)
-        at = at[((at >= 0) & (at < (columns, rows))).all(1)]
-        ties = np.bincount(at[:, 1] * columns + at[:, 0], minlength=rows * columns)
-        near = cv2.blur(
-            ties.reshape(self._shape).astype(np.float32),
-            (NEAR, NEAR),
-            borderType=cv2.BORDER_CONSTANT,
+        inside = ((at >= 0) & (at < (columns, rows))).all(1)
+        point, middle = at[inside] @ (1, columns), float(np.median(xyz[:, 2]))
+        ties, rise = (
+            _around(np.bincount(point, weight, rows * columns).reshape(self._shape), NEAR)
+            for weight in (None, xyz[inside, 2] - middle)
         )
-        self._tied = (near.ravel() * NEAR**2) > TIED - 0.5
+        self._z = middle + rise / np.maximum(ties, 1)
+        self._tied = ties.ravel() > TIED - 0.5
 
     def look(self, view: View, thumbnail: NDArray[Any], mark: Blank | None) -> _Look:
         """What a photo shows, without what shows nothing or a mark."""
-        first = np.floor((view.footprint.min(0) - self._low) / self._step).astype(int)
-        last = np.ceil((view.footprint.max(0) - self._low) / self._step).astype(int)
+        low, high = view.footprint.min(0), view.footprint.max(0)
+        margin = MARGIN * float((high - low).max())  # it was found on level ground
+        first = np.floor((low - margin - self._low) / self._step).astype(int)
+        last = np.ceil((high + margin - self._low) / self._step).astype(int)
         c = np.arange(max(first[0], 0), min(last[0] + 1, self._shape[1]))
         r = np.arange(max(first[1], 0), min(last[1] + 1, self._shape[0]))
         x, y = np.meshgrid(self._low[0] + self._step * c, self._low[1] + self._step * r)
-        nodes = project_nodes(view, x, y, np.full(x.shape, self._z))
+        nodes = project_nodes(view, x, y, self._z[r[0] : r[-1] + 1, c[0] : c[-1] + 1])
         seen = nodes.seen if mark is None else nodes.seen & (mark.at(nodes.u, nodes.v) > 0)
         point = (r[:, None] * self._shape[1] + c)[seen]
         width, height = view.camera.width, view.camera.height
