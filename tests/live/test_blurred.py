@@ -15,6 +15,7 @@ from skyquilt.live.ledger import Ledger
 from skyquilt.live.live_map import LiveMap
 from skyquilt.live.settings import LiveSettings
 from skyquilt.live.tile_drawing import WHOLE
+from skyquilt.live.veils import LiveVeils
 from skyquilt.ortho.blend import Feather
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, Route
@@ -74,6 +75,7 @@ def maps(tmp_path_factory):
     ]
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(LiveBlur, "look", lambda *_: [])
+        patched.setattr(LiveVeils, "look", lambda *_: [])  # blur takes contrast, too
         found.append(fed(LiveMap(folder / "all", settings), paths))
     yield found
     for live in found:

@@ -142,7 +142,7 @@ class LiveMap:
         neighbours = Neighbours(self.members, metadata)
         self.live_links = LiveLinks(self.members, self.methods, self.store, self.full)
         blur = LiveBlur(self.live_links)
-        veils = LiveVeils(self.live_links, self.heights)
+        veils = LiveVeils(self.live_links, self.heights, blur.blurred)
         local_pose = LocalPose(self.members, metadata, neighbours, self.live_links, self.settings)
         self.canvas = Canvas(
             self.tiles,

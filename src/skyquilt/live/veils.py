@@ -6,6 +6,7 @@ costs as much however large the map is.
 """
 
 import json
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from skyquilt.live.members import Member
 from skyquilt.live.tile_drawing import layer_of
 from skyquilt.model.photo import Photo
 from skyquilt.ortho.height_cells import HeightCells
+from skyquilt.ortho.spoilt import overexposed
 from skyquilt.ortho.tie_surface import level
 from skyquilt.ortho.veiled import FEWEST_VIEWS, cells_of, veiled_note, veiled_parts
 from skyquilt.outside import whole
@@ -45,9 +47,12 @@ MOST = 10**9
 class LiveVeils:
     """Which parts of photos are veiled."""
 
-    def __init__(self, live_links: LiveLinks, heights: HeightCells) -> None:
-        """Reads what was known before a restart."""
+    def __init__(
+        self, live_links: LiveLinks, heights: HeightCells, blurred: Collection[int]
+    ) -> None:
+        """Reads what was known before a restart. `blurred`: photos that are, now and later."""
         self.live_links, self.members, self.heights = live_links, live_links.members, heights
+        self._blurred = blurred
         kept = self.members.ledger.rows("select key, value from meta where key glob ?", f"{KEY}*")
         found = {whole(key.removeprefix(KEY), 1, MOST): value for key, value in kept}
         self._veils = dict[int, Blank]()
@@ -76,10 +81,21 @@ class LiveVeils:
             ledger.put_meta(f"{KEY}{i}", room.ravel().tolist())
             new.append(i)
         if new:
-            note = veiled_note([self.members.by_id[i].photo.name for i in sorted(self._veils)])
-            count = len(self._veils)
-            tell_doubled(ledger, NOTED, count, lambda: [note if count < 2 else f"So far {note}"])
+            tell_doubled(ledger, NOTED, len(self._veils), self._notes)
         return [self.members.by_id[i] for i in new]
+
+    def _notes(self) -> list[str]:
+        """What is told of all veils so far."""
+        by_id = self.members.by_id
+        names = [by_id[i].photo.name for i in sorted(self._veils) if not self._spoilt(i)]
+        return [f"So far: {veiled_note(names)}"] if names else []
+
+    def _spoilt(self, number: int) -> bool:
+        """Whether a photo lacks contrast for another reason, which is told besides."""
+        photo = self.members.by_id[number].photo
+        size = photo.width, photo.height
+        white = overexposed(self.live_links.thumbnail(number), size)
+        return number in self._blurred or white is not None
 
     def _found(self, member: Member) -> dict[int, Blank]:
         """What is veiled in a photo and those around it, by their numbers: until there is a veil,
@@ -112,7 +128,8 @@ class LiveVeils:
         fixed = {i: mark for i, mark in marks.items() if mark is not None}
         if not len(xyz):
             return {}
-        return veiled_parts(views, xyz, thumbnails, fixed, least=least)
+        spoilt = [v.photo for v in views if least and self._spoilt(v.photo)]
+        return veiled_parts(views, xyz, thumbnails, fixed, least=least, spoilt=spoilt)
 
     def _around(self, member: Member, rings: int) -> list[Member]:
         """A photo and the nearest that are linked with it, of two rings also those that are linked
