@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from playwright.sync_api import sync_playwright
 
 from skyquilt.live.settings import LiveSettings
 from tests.end_to_end.conftest import relabel
@@ -20,21 +19,6 @@ pytestmark = pytest.mark.slow
 QUICK = LiveSettings(features=600)
 SHOTS = os.environ.get("SKYQUILT_SCREENSHOTS")
 """A folder to keep screenshots in, for a person to look at."""
-
-
-@pytest.fixture(scope="module")
-def browser():
-    path = (
-        shutil.which("chromium")
-        or shutil.which("chromium-browser")
-        or shutil.which("google-chrome")
-    )
-    if path is None:
-        pytest.skip("no Chromium is installed: apt install chromium")
-    with sync_playwright() as play:
-        chromium = play.chromium.launch(executable_path=path, args=["--no-sandbox"])
-        yield chromium
-        chromium.close()
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.accessible import problems
-from tests.live.test_browser import browser, holds, page, shot  # noqa: F401 - fixtures
+from tests.live.test_browser import holds, page, shot  # noqa: F401 - fixtures
 from tests.live.test_browser import seen as page_pixels
 from tests.live.test_mission import plan_of, watched
 

@@ -2,14 +2,12 @@
 
 import contextlib
 import io
-import shutil
 import socket
 import threading
 
 import numpy as np
 import pytest
 from PIL import Image
-from playwright.sync_api import sync_playwright
 
 from skyquilt.server.access import Guard
 from skyquilt.server.server_thread import ServerThread
@@ -33,17 +31,6 @@ WIDE = """() => [...document.querySelectorAll(':root, #panel, #panel *, dialog *
     && !e.closest('.sheet') && getComputedStyle(e).overflowX !== 'visible')
   .map((e) => `${e.id || e.tagName}: ${e.scrollWidth} in ${e.clientWidth}`)"""
 """What has to be scrolled sideways."""
-
-
-@pytest.fixture(scope="module")
-def browser():
-    path = shutil.which("chromium") or shutil.which("chromium-browser")
-    if path is None:
-        pytest.skip("no Chromium is installed: apt install chromium")
-    with sync_playwright() as play:
-        chromium = play.chromium.launch(executable_path=path, args=["--no-sandbox"])
-        yield chromium
-        chromium.close()
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,6 @@
 import io
 import json
 import os
-import shutil
 import socket
 import socketserver
 import threading
@@ -13,7 +12,6 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 from PIL import Image
-from playwright.sync_api import sync_playwright
 from pyproj import Transformer
 
 from skyquilt.server.access import Guard
@@ -42,17 +40,6 @@ def site(run):
     survey = open_survey(run)
     with ServerThread(survey=survey, guard=Guard(), folder=run) as serving:
         yield serving.url
-
-
-@pytest.fixture(scope="module")
-def browser():
-    path = shutil.which("chromium") or shutil.which("chromium-browser")
-    if path is None:
-        pytest.skip("no Chromium is installed: apt install chromium")
-    with sync_playwright() as play:
-        chromium = play.chromium.launch(executable_path=path, args=["--no-sandbox"])
-        yield chromium
-        chromium.close()
 
 
 def opened(browser, site, look="light"):
