@@ -148,11 +148,15 @@ def remove_file(path: Path) -> None:
     _unless_read(lambda: path.unlink(missing_ok=True))
 
 
-def remove_folder(path: Path) -> None:
-    """Removes a folder with all that is in it; what the system refuses to remove stays."""
+def remove_folder(path: Path, *, whole: bool = False) -> None:
+    """Removes a folder with all that is in it; what the system refuses to remove stays, and where
+    the `whole` folder must go, `OSError` is raised.
+    """
     try:
         _unless_read(lambda: shutil.rmtree(path))
     except OSError:
+        if whole:
+            raise
         shutil.rmtree(path, ignore_errors=True)
 
 

@@ -11,15 +11,16 @@ from rasterio.windows import from_bounds
 
 from skyquilt.imaging.blank import around
 from skyquilt.imaging.views import footprint, make_views
+from skyquilt.ortho.spoilt import spoilt_parts
 from skyquilt.ortho.tie_surface import level
-from skyquilt.ortho.veiled import find_veiled, veiled_parts
+from skyquilt.ortho.veiled import veiled_parts
 from skyquilt.settings import MosaicSettings
 from skyquilt.simulate import preset, simulate
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Pictures, Route
 from skyquilt.workflows.mosaic import mosaic
 from tests.ortho.scenes import CAMERA
-from tests.ortho.test_sharpness import flight
+from tests.ortho.test_sharpness import flight, seen
 from tests.ortho.test_spoilt import pictures
 from tests.ortho.test_spoilt import shown as judged
 
@@ -37,7 +38,12 @@ def clean(alignment):
 
 
 def found(alignment, shown, fixed=None):
-    return find_veiled(alignment, shown, fixed or {})
+    views = make_views(alignment, level(0.0))
+    return (
+        veiled_parts(views, alignment.ties.xyz, shown, fixed or {})
+        if len(alignment.ties.xyz)
+        else {}
+    )
 
 
 def veiled(picture, share, tone):
@@ -68,6 +74,19 @@ def test_what_smoke_veils_yields_and_is_named(alignment, clean, tone, share, lea
     )
 
 
+def test_drops_on_the_lens_hide_no_smoke(alignment, clean):
+    """They blur a part of all photos, not all of any."""
+    details = [d.astype(np.float32) for d in seen(alignment)]
+    for detail in details:
+        detail[3:5, 4:6, 2] -= 4
+    shown = {**clean, 4: veiled(clean[4], cloud(120, 150, 140, 0.85), 215)}
+    names = [f"{k}.jpg" for k in clean]
+    marks, notes = spoilt_parts(alignment, lambda k: details[k], shown, names, {})
+    assert sorted(marks) == list(range(12))
+    assert any("blurred at the same place" in note for note in notes)
+    assert any("(4.jpg)" in note and "smoke" in note for note in notes)
+
+
 def test_a_photo_in_fog_yields_altogether(alignment, clean):
     shown = dict(clean)
     shown[5] = veiled(clean[5], np.full((300, 400), 0.7), 200)
@@ -82,7 +101,9 @@ def test_clear_photos_stay_as_they_are(alignment, clean):
     lit[3] = (clean[3] * (1 - cloud(200, 150, 150, 0.5))[..., None]).astype(np.uint8)
     assert found(alignment, lit) == {}
     # measured values, and places that only two photos show
-    assert found(alignment, {i: p.astype(np.float32) for i, p in clean.items()}) == {}
+    fog = {**clean, 4: veiled(clean[4], np.full((300, 400), 0.8), 215)}
+    assert found(alignment, fog)
+    assert judged(alignment, {i: p.astype(np.float32) for i, p in fog.items()}) == ({}, ())
     apart = flight(12, apart=30.0)
     fog = pictures(apart)
     fog[4] = veiled(fog[4], np.full((300, 400), 0.8), 215)

@@ -225,9 +225,7 @@ def remove_run(path: Path) -> None:
     try:
         _remove_files(path)
         lock.close()
-        remove_folder(path / STATE)
-        if (path / STATE).exists():
-            raise OSError(errno.EACCES, os.strerror(errno.EACCES), str(path / STATE))
+        remove_folder(path / STATE, whole=True)
     except OSError as error:
         raise refusal(path, error) from error
     with suppress(OSError):  # it holds files of others

@@ -92,10 +92,12 @@ class LiveVeils:
 
     def _spoilt(self, number: int) -> bool:
         """Whether a photo lacks contrast for another reason, which is told besides."""
+        if number in self._blurred:
+            return True
         photo = self.members.by_id[number].photo
         size = photo.width, photo.height
         white = overexposed(self.live_links.thumbnail(number), size)
-        return number in self._blurred or white is not None
+        return white is not None
 
     def _found(self, member: Member) -> dict[int, Blank]:
         """What is veiled in a photo and those around it, by their numbers: until there is a veil,
@@ -116,18 +118,22 @@ class LiveVeils:
         ground = self.heights.median((*known.min(0) - around, *known.max(0) + around))
         if ground is None:
             return {}
-        views = [v for m in alike if (v := self._view(m, ground)) is not None]
+        thumbnails = {m.id: self.live_links.thumbnail(m.id) for m in alike}
+        views = [
+            v
+            for m in alike
+            if thumbnails[m.id].dtype == np.uint8 and (v := self._view(m, ground)) is not None
+        ]
         if len(views) < FEWEST_VIEWS:
             return {}
         outline = np.concatenate([v.footprint for v in views])
         xy = self.heights.places((*outline.min(0), *outline.max(0)))
+        if not len(xy):
+            return {}
         z = self.heights.at(np.floor(xy / self.heights.cell).astype(np.int64))
         xyz = np.column_stack([xy, z])
-        thumbnails = {v.photo: self.live_links.thumbnail(v.photo) for v in views}
         marks = {m.id: self.live_links.marks.shown(m.photo.camera_key) for m in alike}
         fixed = {i: mark for i, mark in marks.items() if mark is not None}
-        if not len(xyz):
-            return {}
         spoilt = [v.photo for v in views if least and self._spoilt(v.photo)]
         return veiled_parts(views, xyz, thumbnails, fixed, least=least, spoilt=spoilt)
 

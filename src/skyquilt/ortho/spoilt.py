@@ -13,13 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.imaging.blank import Blank, around, joined
+from skyquilt.imaging.nodes import View
 from skyquilt.imaging.views import make_views
 from skyquilt.model.poses import Alignment
+from skyquilt.model.surface import Surface
 from skyquilt.ortho.exposure import Balance, Samples
 from skyquilt.ortho.radiometry import InGrey
 from skyquilt.ortho.sharpness import FEWEST_SPOILT, LARGEST_SPOT, find_blurred
 from skyquilt.ortho.tie_surface import level
-from skyquilt.ortho.veiled import find_veiled, veiled_note
+from skyquilt.ortho.veiled import veiled_note, veiled_parts
 from skyquilt.photos.side_rows import sentence_of
 
 WHITE = 250
@@ -61,18 +63,24 @@ def spoilt_parts(
     `fixed`: where they show marks.
     """
     blurred, notes = find_blurred(alignment, details, names)
-    white = dict[int, Blank]()
+    white, of_8_bits = dict[int, Blank](), set[int]()
     for i in sorted(alignment.poses):
-        camera = alignment.camera(i)
-        if part := overexposed(thumbnails[i], (camera.width, camera.height)):
+        camera, thumbnail = alignment.camera(i), thumbnails[i]
+        if thumbnail.dtype == np.uint8:
+            of_8_bits.add(i)
+        if part := overexposed(thumbnail, (camera.width, camera.height)):
             white[i] = part
     if white:
         notes += (overexposed_note([names[i] for i in white]),)
-    spots, told = find_spots(alignment, thumbnails)
+    xyz = alignment.ties.xyz
+    flat = level(float(np.median(xyz[:, 2])) if len(xyz) else 0.0)
+    views = [v for v in make_views(alignment, flat) if v.photo in of_8_bits]
+    spots, told = find_spots(alignment, views, flat, thumbnails)
     notes += told
-    veiled = find_veiled(alignment, thumbnails, fixed, {*white, *blurred})
-    # what is overexposed or blurred has little contrast as well, and was told
-    if unnamed := sorted(veiled.keys() - white.keys() - blurred.keys()):
+    # what is overexposed or blurred has little contrast as well, and was told; a drop is not all
+    pale = white.keys() | {i for i, part in blurred.items() if (part.room < 0).all()}
+    veiled = veiled_parts(views, xyz, thumbnails, fixed, spoilt=pale) if len(xyz) else {}
+    if unnamed := sorted(veiled.keys() - pale):
         notes += (veiled_note([names[i] for i in unnamed]),)
     out = dict(fixed)
     for found in (blurred, white, spots, veiled):
@@ -103,18 +111,15 @@ def overexposed(thumbnail: NDArray[Any], size: tuple[int, int]) -> Blank | None:
 
 
 def find_spots(
-    alignment: Alignment, thumbnails: Mapping[int, NDArray[Any]]
+    alignment: Alignment,
+    views: Sequence[View],
+    flat: Surface,
+    thumbnails: Mapping[int, NDArray[Any]],
 ) -> tuple[dict[int, Blank], tuple[str, ...]]:
     """Dark spots at the same place of all pictures of a camera, by photo (index), and notes.
-    `thumbnails`: (h, w[, bands]) of the photos; only those of 8 bits are judged.
+    `views` of level ground, `flat`; `thumbnails`: (h, w[, bands]) of their photos, of 8 bits.
     """
-    photos = {i for i in alignment.poses if thumbnails[i].dtype == np.uint8}
-    if len(photos) < FEWEST_SPOILT:
-        return {}, ()
-    xyz = alignment.ties.xyz
-    flat = level(float(np.median(xyz[:, 2])) if len(xyz) else 0.0)
-    views = [v for v in make_views(alignment, flat) if v.photo in photos]
-    if not views:
+    if len(views) < FEWEST_SPOILT:
         return {}, ()
     outline = np.concatenate([v.footprint for v in views])
     (west, south), (east, north) = outline.min(0), outline.max(0)

@@ -16,9 +16,6 @@ from numpy.typing import NDArray
 from skyquilt.imaging.blank import EMPTY, Blank
 from skyquilt.imaging.grey import to_grey8
 from skyquilt.imaging.nodes import View, project_nodes
-from skyquilt.imaging.views import make_views
-from skyquilt.model.poses import Alignment
-from skyquilt.ortho.tie_surface import level
 from skyquilt.photos.side_rows import sentence_of
 
 Float = NDArray[np.float32]
@@ -60,23 +57,6 @@ KNOWN = 0.3
 """Known share of the cells around one that tells of it."""
 
 
-def find_veiled(
-    alignment: Alignment,
-    thumbnails: Mapping[int, NDArray[Any]],
-    fixed: Mapping[int, Blank],
-    spoilt: Collection[int] = (),
-) -> dict[int, Blank]:
-    """What smoke, fog or haze veils, by photo (index), only of photos where something is.
-    `thumbnails`: (h, w[, bands]) of the photos, of which those of 8 bits are judged; `fixed`: where
-    they show marks; `spoilt`: photos that lack contrast for another reason.
-    """
-    xyz = alignment.ties.xyz
-    if not len(xyz):
-        return {}
-    views = make_views(alignment, level(float(np.median(xyz[:, 2]))))
-    return veiled_parts(views, xyz, thumbnails, fixed, spoilt=spoilt)
-
-
 def veiled_note(names: Sequence[str]) -> str:
     """A note about photos of these names, at least one."""
     some = f"{len(names)} photos show" if len(names) > 1 else "One photo shows"
@@ -96,12 +76,14 @@ def veiled_parts(
     least: float = SURE_SHARE,
     spoilt: Collection[int] = (),
 ) -> dict[int, Blank]:
-    """What is veiled in photos as seen from some views, by photo, only of photos where something
-    is; `xyz`: tie points (n, 3) on their ground, at least one; `least`: share of a picture that
-    must surely be veiled, of one of them that is not `spoilt` anyway.
+    """What smoke, fog or haze veils in photos, by photo, only of photos where something is.
+
+    `views` of level ground; `xyz`: tie points (n, 3) on their ground, at least one; `thumbnails`:
+    (h, w[, bands]) of the photos, of 8 bits; `fixed`: where they show marks; `least`: share of a
+    picture that must surely be veiled, of one that does not lack contrast anyway (`spoilt`).
     """
     found = dict[int, Blank]()
-    for group in _alike([v for v in views if thumbnails[v.photo].dtype == np.uint8]):
+    for group in _alike(views):
         if len(group) >= FEWEST_VIEWS:
             found |= _veiled(group, xyz, thumbnails, fixed, least, spoilt)
     return found
