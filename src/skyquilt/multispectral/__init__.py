@@ -1,0 +1,1 @@
+"""All bands of a multispectral camera on the map's grid, and indices of vegetation."""
