@@ -210,7 +210,7 @@ def _photo(path: Path, name: str, header: Header, thermal_unit: str | None) -> P
         stored=frame.stored if frame else "",
         camera_key=_camera_key(header, width, height),
         calibration=lens.calibration,
-        band_name=_band_name(header),
+        band_name=tag.band_name(header.xmp),
         unusable_calibration=" and ".join(lens.nonsense),
         focal=lens.focal,
         position=position,
@@ -299,7 +299,7 @@ def _thermal_frame(path: Path, header: Header, said: str | None) -> ThermalFrame
     )
     known = said is not None or bool(stored) or _is_lwir(header)
     known = known or (sensor is not None and sensor.band == "thermal")
-    if not known and (not header.stored.startswith("float") or _band_name(header)):
+    if not known and (not header.stored.startswith("float") or tag.band_name(header.xmp)):
         return None
     check_picture(header.width, header.height, 4, most_mp=MOST_THERMAL_MP, option="")
     try:
@@ -333,10 +333,6 @@ def _is_lwir(header: Header) -> bool:
     return not large and "lwir" in header.xmp.text("Camera:BandName", "FLIR:BandName").lower()
 
 
-def _band_name(header: Header) -> str:
-    return plain(" ".join(header.xmp.text("Camera:BandName", "BandName").lower().split()), 40)
-
-
 def _camera_key(header: Header, width: int, height: int) -> str:
     exif, xmp = header.exif, header.xmp
     mm, zoom = exif.number(tag.FOCAL_MM), digital_zoom(exif)
@@ -346,7 +342,7 @@ def _camera_key(header: Header, width: int, height: int) -> str:
         model,
         exif.text(tag.SERIAL) or xmp.text("CameraSerialNumber", "drone-dji:DroneSerialNumber"),
         exif.text(tag.LENS),
-        xmp.text("Camera:BandName"),
+        xmp.text("Camera:BandName", "drone-dji:BandName"),
         f"{width}x{height}",
         f"{mm:.1f}mm" if mm else "",
         f"zoom {zoom:g}" if zoom > 1 else "",

@@ -24,6 +24,8 @@ FOCAL_MM, FOCAL_35MM, ZOOM = 0x920A, 0xA405, 0xA404
 PLANE_X, PLANE_UNIT = 0xA20E, 0xA210
 PIXELS_X, PIXELS_Y = 0xA002, 0xA003
 SERIAL, LENS = 0xA431, 0xA434
+EXPOSURE_S, F_NUMBER, ISO, ISO_SPEED = 0x829A, 0x829D, 0x8827, 0x8833
+BITS, BLACK_LEVEL = 258, 50714
 GPS_LAT_REF, GPS_LAT, GPS_LON_REF, GPS_LON, GPS_ALT_REF, GPS_ALT = 1, 2, 3, 4, 5, 6
 GPS_TIME, GPS_ERROR, GPS_DATE = 7, 0x1F, 0x1D
 
@@ -81,11 +83,11 @@ MOST_ENTRIES = 4096
 """Largest number of tags of a directory."""
 _IMAGE_TAGS = frozenset(
     {MAKE, MODEL, SOFTWARE, ORIENTATION, MODIFIED, DESCRIPTION, GDAL_METADATA, EXIF_IFD, GPS_IFD}
-    | {PIXEL_SCALE, PIXEL_MATRIX, GEO_KEYS}
+    | {PIXEL_SCALE, PIXEL_MATRIX, GEO_KEYS, BITS, BLACK_LEVEL}
 )
 _EXIF_TAGS = frozenset(
     {TAKEN, SUBSEC, OFFSET, FOCAL_MM, FOCAL_35MM, ZOOM, PLANE_X, PLANE_UNIT, PIXELS_X, PIXELS_Y}
-    | {SERIAL, LENS}
+    | {SERIAL, LENS, EXPOSURE_S, F_NUMBER, ISO, ISO_SPEED, BLACK_LEVEL}
 )
 _GPS_TAGS = frozenset(
     {GPS_LAT_REF, GPS_LAT, GPS_LON_REF, GPS_LON, GPS_ALT_REF, GPS_ALT, GPS_TIME, GPS_ERROR}
@@ -249,6 +251,11 @@ class Xmp:
         """A list such as `1.0,2.0`; empty where an item is not a number."""
         items = [parse_number(part) for part in re.split(r"[,\s]+", self.text(name)) if part]
         return () if None in items else tuple(i for i in items if i is not None)
+
+
+def band_name(xmp: Xmp) -> str:
+    """The name of the band that a file shows, in lower case; empty where it tells none."""
+    return plain(" ".join(xmp.text("Camera:BandName", "BandName").lower().split()), 40)
 
 
 def parse_number(text: str) -> float | None:
