@@ -23,7 +23,7 @@ SUN = 3.0
 """More than the sun gives, in W/m2/nm: at the top of the atmosphere it is 2.1 at most."""
 _WAVELENGTH, _WIDTH = (200.0, 20_000.0), (0.5, 15_000.0)
 _EXPOSURE_S, _GAIN, _APERTURE = (1e-7, 60.0), (1e-3, 1e4), (0.3, 100.0)
-_LEAST, _MOST = 1e-12, 1e12
+_LEAST, _MOST = 1e-9, 1e9
 """Limits of numbers whose unit is the maker's own."""
 _MOST_TERMS, _MOST_POWER, _MOST_RADIAL = 64, 8, 8
 """Largest number of terms of a polynomial in columns and rows, its largest exponent, and the
@@ -117,7 +117,7 @@ class BandTags:
     irradiance_si: bool = False
     """Whether it is in W/m2/nm; else its unit is the maker's own."""
     normalised: bool = False
-    """Whether the file says that its values are corrected already."""
+    """Whether its values are corrected already: it says so, or they are real numbers."""
     notes: tuple[str, ...] = ()
     """Sentences on what was ignored."""
 
@@ -155,7 +155,7 @@ def band_tags(header: Header) -> BandTags:
         vignetting=said.vignetting(),
         irradiance=irradiance,
         irradiance_si=si,
-        normalised=said.xmp.text("Camera:IsNormalized").lower() in ("1", "true"),
+        normalised=said.normalised(),
         notes=tuple(said.notes),
     )
 
@@ -232,6 +232,11 @@ class _Said:
                 self.ignore("BandFreq", text, "it is not a wavelength and a width")
         return wavelength, width
 
+    def normalised(self) -> bool:
+        """Whether the values are no counts."""
+        said = self.xmp.text("Camera:IsNormalized").lower() in ("1", "true")
+        return said or self.header.stored.startswith("float")
+
     def index(self) -> int | None:
         """The camera's number in the rig."""
         return whole(self.xmp.text("Camera:RigCameraIndex", "SensorIndex", "DLS:SensorId"), 0, 99)
@@ -243,7 +248,7 @@ class _Said:
         found = self.within("number of bits", as_number(value), (1, 64))
         if found is None:
             found = self.number("BitsPerSample", (1, 64))
-        return None if found is None else int(found)
+        return {"uint8": 8, "uint16": 16}.get(self.header.dtype) if found is None else int(found)
 
     def black_level(self, bits: int | None) -> float | None:
         """The mean of the levels of the four pixels of a pattern."""
@@ -378,7 +383,8 @@ def _readings(text: str) -> list[tuple[int, int, int]]:
     the Sequoia's list, which is in base 64; a torn end is left out.
     """
     clean = re.split(r"[^A-Za-z0-9+/]", text, maxsplit=1)[0]
-    data = base64.b64decode(clean[: len(clean) // 4 * 4])
+    clean = clean[:-1] if len(clean) % 4 == 1 else clean
+    data = base64.b64decode(clean + "=" * (-len(clean) % 4))
     whole_ones = data[: len(data) // _READING.size * _READING.size]
     return [(r[1], r[3], r[4]) for r in _READING.iter_unpack(whole_ones)]
 
