@@ -147,7 +147,7 @@ class Reflectance:
         if self.kind == "counts":
             return values
         full = values >= self.saturated
-        values = np.maximum(values - np.float32(self.black_level), 0)  # NaN stays NaN
+        np.maximum(values - np.float32(self.black_level), 0, out=values)  # NaN stays NaN
         factor = self.scale / (self.irradiance or 1.0)
         values *= np.float32(math.pi * factor if self.kind == "reflectance" else factor)
         rows, columns = np.arange(values.shape[0]) + row0, np.arange(values.shape[1]) + column0
