@@ -79,7 +79,7 @@ MICASENSE = {
 """As a RedEdge-MX writes them."""
 
 
-def micasense(path, counts, exposure=0.0012, model="RedEdge-M", software="v7.5.0", **changes):
+def micasense(path, counts, exposure=0.0004, model="RedEdge-M", software="v7.5.0", **changes):
     """A file of a MicaSense camera; a change to None leaves a tag out."""
     values = {k: v for k, v in (MICASENSE | changes).items() if v is not None}
     image = [(271, "MicaSense"), (272, model), (305, software), (50714, [4800, 4816, 4784, 4800])]

@@ -31,7 +31,7 @@ def test_micasense(path):
         index=4,
         black_level=4800,
         bits=16,
-        exposure_s=0.0012,
+        exposure_s=0.0004,
         gain=2.0,
         f_number=2.8,
         radiometric=(0.00014576, 1.394e-07, 1.171e-05),

@@ -232,18 +232,22 @@ WINDOW = 11
 REACH_S = 60.0
 """Largest time in s between a capture and those whose readings serve for it."""
 _NEAR = 3.0
-"""A reading is near the others up to so many of their deviations."""
-_SIGMA_PER_MAD = 1.4826
+"""A reading is near the median of those around it up to so many deviations of the jitter."""
+_SAME = 1e-9
+"""Relative difference up to which readings are the same."""
+_SIGMA_PER_MEDIAN = 1.4826
+"""Standard deviation of normal deviates over the median of their sizes."""
 
 
 def smoothed_irradiance(times_s: ArrayLike, values: ArrayLike) -> NDArray[np.float64]:
     """Readings (n,) of a sun sensor, in any unit, without their jitter: a drone that tilts changes
     them by some percent from capture to capture.
 
-    Each is the mean of those of the captures around it that are near their median; what changes for
-    at least half of these `WINDOW` captures stays, as a cloud does. `times_s`: (n,) times in s, in
-    any order; a capture without a time (NaN) keeps its own reading. What is not greater than 0
-    counts as no reading; the result is NaN where there is none nearby.
+    Each is the mean of those of the captures around it that are near their median, by the jitter of
+    the whole flight. So what changes for at least half of these `WINDOW` captures stays, as a cloud
+    does, and shorter changes are taken for faults. `times_s`: (n,) times in s, in any order; a
+    capture without a time (NaN) keeps its own reading. What is not greater than 0 counts as no
+    reading; the result is NaN where there is none nearby.
 
     Raises:
         ValueError: times and values are not of one length.
@@ -255,18 +259,23 @@ def smoothed_irradiance(times_s: ArrayLike, values: ArrayLike) -> NDArray[np.flo
     found = read.copy()
     timed = np.flatnonzero(np.isfinite(times))
     order = timed[np.argsort(times[timed], kind="stable")]
+    logs = np.log(read)
+    near = _NEAR * _jitter(logs[order])
     half = WINDOW // 2
     for k, at in enumerate(order):
         around = order[max(k - half, 0) : k + half + 1]
-        near = read[around[np.abs(times[around] - times[at]) <= REACH_S]]
-        found[at] = _middle(near[np.isfinite(near)])
+        around = around[(np.abs(times[around] - times[at]) <= REACH_S) & np.isfinite(read[around])]
+        if around.size:
+            away = np.abs(logs[around] - np.median(logs[around]))
+            # of an even number of readings none may be as near as that, but two alike
+            found[at] = read[around[away <= max(near, away.min()) + _SAME]].mean()
     return found
 
 
-def _middle(readings: NDArray[np.float64]) -> float:
-    """The mean of the readings that are near their median."""
-    if not readings.size:
-        return math.nan
-    median = np.median(readings)
-    away = np.abs(readings - median)
-    return float(readings[away <= _NEAR * _SIGMA_PER_MAD * np.median(away)].mean())
+def _jitter(logs: NDArray[np.float64]) -> float:
+    """Standard deviation of the jitter of readings, by the differences of successive ones, which
+    light that changes slowly, or seldom, hardly affects.
+    """
+    known = logs[np.isfinite(logs)]
+    steps = np.abs(np.diff(known))
+    return float(_SIGMA_PER_MEDIAN * np.median(steps) / math.sqrt(2)) if steps.size else 0.0
