@@ -24,6 +24,8 @@ from shapely import box
 
 from skyquilt.errors import SkyquiltError, UnreadablePhotoError
 from skyquilt.model.photo import Focal, Photo, RejectedPhoto
+from skyquilt.multispectral.reflectance import Reflectance
+from skyquilt.photos.band_tags import read_band_tags
 from skyquilt.photos.cameras_json import apply_cameras, read_cameras_json
 from skyquilt.photos.distances import read_distances
 from skyquilt.photos.gcp import read_gcp_list
@@ -305,6 +307,104 @@ def _xmp_only(data):
         found.text(name)
         found.number(name)
         found.numbers(name)
+
+
+# -- bands of multispectral cameras
+
+
+def _bands(data):
+    """What a file tells of its band, and counts converted by it."""
+    try:
+        tags = read_band_tags(_file("band", data))
+    except UnreadablePhotoError as error:
+        _sentence(error)
+        return
+    numbers = [v for v in vars(tags).values() if isinstance(v, float)]
+    assert np.isfinite(numbers).all(), numbers
+    assert all(k.isprintable() for k in (tags.name, tags.capture, *tags.notes))
+    counts = np.array([[0, 30_000], [65_000, 65_535]], np.uint16)
+    for width, height in ((2, 2), (64, 48)):
+        found = Reflectance.of(tags, width, height)
+        assert all(note.isprintable() for note in found.notes)
+        values = found(counts)
+        assert not np.isinf(values).any() and values[0, 0] == 0, values
+
+
+_NAMES = {
+    "Camera": "http://pix4d.com/camera/1.0",
+    "MicaSense": "http://micasense.com/MicaSense/1.0/",
+    "DLS": "http://micasense.com/DLS/1.0/",
+    "drone-dji": "http://www.dji.com/drone-dji/1.0/",
+}
+MAKERS = {
+    "MicaSense": {
+        "Camera:BandName": "Red",
+        "Camera:CentralWavelength": "668",
+        "Camera:WavelengthFWHM": "10",
+        "Camera:RigCameraIndex": "2",
+        "Camera:VignettingCenter": "32,24",
+        "Camera:VignettingPolynomial": "-1e-4,1e-6,-1e-8,3e-11,-3e-14,1e-17",
+        "MicaSense:RadiometricCalibration": "1.4e-4,1.3e-7,1.1e-5",
+        "MicaSense:CaptureId": "DFj0",
+        "DLS:HorizontalIrradiance": "118",
+        "DLS:IrradianceScaleToSIUnits": "0.01",
+    },
+    "DJI": {
+        "drone-dji:BandName": "NIR",
+        "drone-dji:BandFreq": "860(+/-26)nm",
+        "drone-dji:SensorIndex": "4",
+        "drone-dji:CaptureUUID": "3377fb05",
+        "drone-dji:BlackCurrent": "3200",
+        "drone-dji:SensorGain": "1.5",
+        "drone-dji:SensorGainAdjustment": "1.002",
+        "drone-dji:ExposureTime": "1000",
+        "drone-dji:Irradiance": "9741.7",
+        "drone-dji:CalibratedOpticalCenterX": "32",
+        "drone-dji:CalibratedOpticalCenterY": "24",
+        "drone-dji:VignettingData": "1e-4, 1e-6, 1e-8, 1e-11, 1e-14, 1e-17",
+    },
+    "Parrot": {
+        "Camera:BandName": "Green",
+        "Camera:SensorModel": "1.04,3997.5,180.25",
+        "Camera:VignettingPolynomial2DName": "0,0,1,0,0,1",
+        "Camera:VignettingPolynomial2D": "0.9,0.05,0.04",
+        "Camera:IrradianceCalibrationMeasurement": "0,600,33,17,1,600,820,417",
+        "Camera:IrradianceList": base64.b64encode(
+            struct.pack("<QHHHHfff", 10**9, 330, 160, 1, 100, 1.5, 0.5, 0.2) * 2
+        ).decode(),
+    },
+}
+"""What makers write of a band."""
+
+
+def _bands_of_makers():
+    """As TIFFs; and as JPEGs, which tell the exposure, too."""
+    found, counts = [], np.full((48, 64), 20_000, np.uint16)
+    for maker, told in MAKERS.items():
+        spaces = " ".join(f'xmlns:{name}="{uri}"' for name, uri in _NAMES.items())
+        words = " ".join(f'{name}="{value}"' for name, value in told.items())
+        xmp = (
+            '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF'
+            ' xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+            f"<rdf:Description {spaces} {words}/></rdf:RDF></x:xmpmeta>"
+        ).encode()
+        more = [(700, "B", len(xmp), xmp, True), (50714, "H", 4, [4800] * 4, True)]
+        more += [(271, "s", 0, maker, True), (33434, 5, 1, (1, 800), True)]
+        more += [(33437, 5, 1, (22, 10), True), (34855, "H", 1, 200, True)]
+        found.append(_saved(lambda b, m=more: tifffile.imwrite(b, counts, extratags=m)))
+        exif = {
+            "0th": {piexif.ImageIFD.Make: maker, piexif.ImageIFD.BlackLevel: (48, 1)},
+            "Exif": {
+                piexif.ExifIFD.ExposureTime: (1, 800),
+                piexif.ExifIFD.FNumber: (22, 10),
+                piexif.ExifIFD.ISOSpeedRatings: 200,
+            },
+        }
+        grey = Image.fromarray(_pixels()[..., 0])
+        block = piexif.dump(exif)
+        plain = _saved(lambda b, g=grey, e=block: g.save(b, "JPEG", exif=e))
+        found.append(_with_segments(plain, (0xE1, b"http://ns.adobe.com/xap/1.0/\0" + xmp)))
+    return found
 
 
 # -- side files
@@ -657,6 +757,7 @@ TARGETS = {
     "jpeg": Target(_photo(".jpg"), _jpegs, "jpeg"),
     "tiff": Target(_photo(".tif"), _tiffs, "tiff"),
     "png": Target(_photo(".png"), _pngs, "png"),
+    "bands": Target(_bands, _bands_of_makers, "bands"),
     "mp4": Target(_container, _clips, "mp4"),
     "codec": Target(_codec, _descriptions, "codec"),
     "track": Target(_track, lambda: [TELEMETRY, TIMED, GPX], "track"),

@@ -95,6 +95,14 @@ def test_bands_of_dji_have_one_factor(tags_of):
     assert_allclose(*found, rtol=1e-4)
 
 
+def test_exposures_of_the_sequoia_are_comparable(tags_of):
+    """Exposure time, ISO, f-number and light of one photo are not those of the next."""
+    tags = tags_of(sequoia)
+    other = replace(tags, exposure_s=0.0007, gain=4.0, f_number=2.8, irradiance=2.1)
+    found = [Reflectance.of(t, WIDTH, HEIGHT)(of_sequoia(SHARE, t)) for t in (tags, other)]
+    assert_allclose(*found, rtol=1e-4)
+
+
 def test_twelve_bits(tags_of):
     tags = replace(tags_of(micasense), bits=12, black_level=300.0)
     counts = of_micasense(SHARE, tags, 12)

@@ -206,6 +206,7 @@ def test_names(name, wavelength, same):
         (micasense, {"Camera__WavelengthFWHM": "1e9"}, "width_nm", "WavelengthFWHM"),
         (micasense, {"exposure": 0.0}, "exposure_s", "exposure time"),
         (sequoia, {"Camera__SensorModel": "1,2"}, "sensor_model", "SensorModel"),
+        (sequoia, {"Camera__SensorModel": "1,-2,3"}, "sensor_model", "SensorModel"),
         (sequoia, {"Camera__VignettingPolynomial2D": "1"}, "vignetting", "2DName"),
         (
             sequoia,

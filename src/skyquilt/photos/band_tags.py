@@ -150,8 +150,8 @@ def band_tags(header: Header) -> BandTags:
         gain=said.gain(),
         gain_adjustment=said.number("SensorGainAdjustment", _GAIN),
         f_number=said.within("f-number", header.exif.number(tag.F_NUMBER), _APERTURE),
-        radiometric=said.three("RadiometricCalibration", first=(_LEAST, _MOST)),
-        sensor_model=said.three("SensorModel", first=(_LEAST, _MOST)),
+        radiometric=said.three("RadiometricCalibration"),
+        sensor_model=said.sensor_model(bits),
         vignetting=said.vignetting(),
         irradiance=irradiance,
         irradiance_si=si,
@@ -208,14 +208,19 @@ class _Said:
             return ()
         return found
 
-    def three(self, name: str, first: tuple[float, float]) -> tuple[float, float, float] | None:
+    def three(self, name: str) -> tuple[float, float, float] | None:
         """Three numbers, of which the first is a sensitivity, greater than 0."""
         found = self.numbers(name, 3, 3)
-        if not found:
-            return None
-        if self.within(name, found[0], first) is None:
+        if not found or self.within(name, found[0], (_LEAST, _MOST)) is None:
             return None
         return found[0], found[1], found[2]
+
+    def sensor_model(self, bits: int | None) -> tuple[float, float, float] | None:
+        """The Sequoia's, whose second number is a count without light."""
+        found = self.three("SensorModel")
+        if found and self.within("SensorModel", found[1], _counts(bits)) is None:
+            return None
+        return found
 
     def band(self) -> tuple[float | None, float | None]:
         """Wavelength and full width in nm; DJI writes half of the latter."""
@@ -253,7 +258,7 @@ class _Said:
     def black_level(self, bits: int | None) -> float | None:
         """The mean of the levels of the four pixels of a pattern."""
         value = self.exif.tags.get(tag.BLACK_LEVEL)
-        limits = (0.0, 2.0 ** (bits or 16) - 1)
+        limits = _counts(bits)
         if value is not None:
             levels = [as_number(v) for v in (value if isinstance(value, tuple) else (value,))]
             known = [level for level in levels if level is not None]
@@ -376,6 +381,11 @@ class _Said:
             self.ignore("IrradianceList", text[:20], "it has no usable reading")
             return None
         return median(found)
+
+
+def _counts(bits: int | None) -> tuple[float, float]:
+    """The least and the greatest count."""
+    return 0.0, 2.0 ** (bits or 16) - 1
 
 
 def _readings(text: str) -> list[tuple[int, int, int]]:

@@ -81,13 +81,15 @@ MOST_TEXT = 4000
 """Largest number of characters of a text."""
 MOST_ENTRIES = 4096
 """Largest number of tags of a directory."""
-_IMAGE_TAGS = frozenset(
+_COUNT_TAGS = frozenset({EXPOSURE_S, F_NUMBER, ISO, ISO_SPEED, BLACK_LEVEL})
+"""How counts came about; cameras write these into either directory."""
+_IMAGE_TAGS = _COUNT_TAGS | frozenset(
     {MAKE, MODEL, SOFTWARE, ORIENTATION, MODIFIED, DESCRIPTION, GDAL_METADATA, EXIF_IFD, GPS_IFD}
-    | {PIXEL_SCALE, PIXEL_MATRIX, GEO_KEYS, BITS, BLACK_LEVEL}
+    | {PIXEL_SCALE, PIXEL_MATRIX, GEO_KEYS, BITS}
 )
-_EXIF_TAGS = frozenset(
+_EXIF_TAGS = _COUNT_TAGS | frozenset(
     {TAKEN, SUBSEC, OFFSET, FOCAL_MM, FOCAL_35MM, ZOOM, PLANE_X, PLANE_UNIT, PIXELS_X, PIXELS_Y}
-    | {SERIAL, LENS, EXPOSURE_S, F_NUMBER, ISO, ISO_SPEED, BLACK_LEVEL}
+    | {SERIAL, LENS}
 )
 _GPS_TAGS = frozenset(
     {GPS_LAT_REF, GPS_LAT, GPS_LON_REF, GPS_LON, GPS_ALT_REF, GPS_ALT, GPS_TIME, GPS_ERROR}
