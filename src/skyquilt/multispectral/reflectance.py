@@ -218,13 +218,13 @@ def _fall_off(
             terms[power] += coefficient
         x, y = (np.power.outer(s, np.arange(n)) for s, n in zip(shares, orders, strict=True))
         return np.asarray(y @ terms.T @ x.T, np.float32)
-    across, down = (columns - vignetting.centre[0], rows - vignetting.centre[1])
-    r = np.hypot(across[None, :], down[:, None]).astype(np.float32)
+    across, down = ((n - c) ** 2 for n, c in zip((columns, rows), vignetting.centre, strict=True))
+    r = np.sqrt(across.astype(np.float32)[None, :] + down.astype(np.float32)[:, None])
     found = np.zeros_like(r)
     for coefficient in reversed(vignetting.coefficients):
         found += np.float32(coefficient)
         found *= r
-    return found + 1
+    return np.asarray(found + 1, np.float32)
 
 
 WINDOW = 11
