@@ -37,12 +37,24 @@ def test_the_band_of_most_photos_is_shown():
     assert {p.band_name for p in of_one_band(lost, None).photos} == {"red"}
 
 
-def test_files_without_a_band_stay():
-    colour = [band("", k, channels=3) for k in range(3)]
-    kept = of_one_band(survey(*FIVE.photos, *colour), None)
+def test_files_of_one_channel_without_a_band_stay():
+    grey = [band("", k) for k in range(3)]
+    kept = of_one_band(survey(*FIVE.photos, *grey), None)
     assert [p.band_name for p in kept.photos] == ["green"] * 3 + [""] * 3
-    plain = survey(*colour)
-    assert of_one_band(plain, None) is plain and band_note(colour) == ()
+    plain = survey(*grey)
+    assert of_one_band(plain, None) is plain and band_note(grey) == ()
+
+
+@pytest.mark.parametrize(("number", "wanted"), [(3, None), (3, "nir"), (1, None)])
+def test_photos_in_colours_and_bands_are_not_mixed(number, wanted):
+    """Drones with a camera in colours beside those of the bands write both into one folder."""
+    colours = [band("", k, channels=3) for k in range(number)]
+    kept = of_one_band(survey(*FIVE.photos, *colours), wanted)
+    shown = {p.band_name for p in kept.photos if p.channels == 1}
+    assert shown == ({wanted} if wanted else set() if number == 3 else {"green"})
+    assert sum(p.channels == 3 for p in kept.photos) == (0 if wanted else number)
+    assert {p.band_name for p in kept.other_bands} == {p.band_name for p in FIVE.photos} - shown
+    assert {p.name for p in kept.other_bands} <= {r.name for r in kept.rejected}
 
 
 @pytest.mark.parametrize(("given", "words"), [(FIVE, "blue, green"), (survey(photo()), "none")])

@@ -231,12 +231,13 @@ class Photo:
         return bool(self.band_name) and self.channels == 1
 
     def other_band(self, shown: str) -> str:
-        """The reason why a map of the band `shown` leaves the file out; empty if it shows it too,
-        or is no file of one band.
+        """The reason why a map of the band `shown` (empty: of photos in colours) leaves the file
+        out; empty if it shows it too, or is no file of one band.
         """
         if not self.shows_a_band or self.band_name == shown:
             return ""
-        return f"it shows the band {self.band_name}; the map shows {shown} (--band)"
+        instead = shown or "the photos in colours"
+        return f"it shows the band {self.band_name}; the map shows {instead} (--band)"
 
     notes: tuple[str, ...] = ()
     """Plain sentences: what is missing, invalid or contradictory."""
@@ -272,6 +273,8 @@ class Survey:
     """Image files that could not be used, with reasons."""
     ignored: tuple[str, ...] = ()
     """Names of files that are no photos (text, archives) and are not read."""
+    other_bands: tuple[Photo, ...] = ()
+    """Files of a multispectral camera's other bands, which are among the rejected ones."""
     clips: "tuple[Clip, ...]" = ()
     """Clips whose frames are still to be chosen."""
     notes: tuple[str, ...] = ()

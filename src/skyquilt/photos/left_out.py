@@ -210,8 +210,10 @@ def bands_of(photos: Sequence[Photo]) -> Counter[str]:
 
 
 def of_one_band(survey: Survey, wanted: str | None) -> Survey:
-    """The survey with the files of one band, those of the others left out with a reason; files that
-    name no band stay. `wanted`: its name; None = the one of which there are most.
+    """The survey with the files that the map shows of a camera that writes one for each band; those
+    of other bands, and photos in colours of the same drone, are left out with a reason. Files of
+    one channel that name no band stay. `wanted`: the name of a band; None = photos in colours where
+    there are about as many as of a band, else the band of which there are most.
 
     Raises:
         UsageError: no file shows the band that is wanted.
@@ -220,19 +222,19 @@ def of_one_band(survey: Survey, wanted: str | None) -> Survey:
     if wanted is not None and wanted.lower() not in bands:
         there = f"they show {sentence_of(sorted(bands))}" if bands else "they name none"
         raise UsageError(f"no photo shows the band '{plain(wanted, 40)}' (--band): {there}")
-    if len(bands) < 2 and wanted is None:
+    if not bands or (len(bands) < 2 and wanted is None and not _in_colours(survey.photos)):
         return survey
-    shown = wanted.lower() if wanted is not None else _usual(bands)
-    kept = [p for p in survey.photos if not p.other_band(shown)]
-    out = [
-        RejectedPhoto(name=p.name, reason=reason)
-        for p in survey.photos
-        if (reason := p.other_band(shown))
-    ]
+    shown = wanted.lower() if wanted is not None else _usual(survey.photos)
+    out = {p.name: reason for p in survey.photos if (reason := p.other_band(shown))}
+    if wanted is not None:
+        coloured = f"it is in colours; the map shows the band {shown} (--band)"
+        out |= {p.name: coloured for p in survey.photos if p.channels == 3}
+    rejected = [RejectedPhoto(name=name, reason=reason) for name, reason in out.items()]
     return replace(
         survey,
-        photos=tuple(kept),
-        rejected=tuple(sorted((*survey.rejected, *out), key=lambda r: r.name)),
+        photos=tuple(p for p in survey.photos if p.name not in out),
+        rejected=tuple(sorted((*survey.rejected, *rejected), key=lambda r: r.name)),
+        other_bands=tuple(p for p in survey.photos if p.name in out and p.shows_a_band),
     )
 
 
@@ -242,12 +244,27 @@ def band_note(photos: Sequence[Photo]) -> tuple[str, ...]:
     if len(bands) < 2:
         return ()
     listed = sentence_of([f"{name} ({n})" for name, n in sorted(bands.items())])
+    shown = _usual(photos)
+    which = f"one of them, {shown} unless" if shown else "the photos in colours, unless"
     return (
-        f"Each file shows one band of a multispectral camera: {listed}. A map shows one of them,"
-        f" {_usual(bands)} unless --band names another.",
+        f"Each file shows one band of a multispectral camera: {listed}. A map shows {which} --band"
+        " names another; --all-bands draws all of them beside it.",
     )
 
 
-def _usual(bands: Counter[str]) -> str:
-    rank = {name: k for k, name in enumerate(PREFERRED)}
+_AS_MANY = 0.5
+"""Photos in colours are the map where there are at least so many times as many as of a band."""
+
+
+def _in_colours(photos: Sequence[Photo]) -> bool:
+    """Whether photos in colours are about as many as files of the commonest band."""
+    colours = sum(p.channels == 3 and p.band == "visible" for p in photos)
+    return colours > _AS_MANY * max(bands_of(photos).values(), default=0)
+
+
+def _usual(photos: Sequence[Photo]) -> str:
+    """The band that a map shows where none is asked for; empty for photos in colours."""
+    if _in_colours(photos):
+        return ""
+    bands, rank = bands_of(photos), {name: k for k, name in enumerate(PREFERRED)}
     return min(bands, key=lambda name: (-bands[name], rank.get(name, len(rank)), name))
