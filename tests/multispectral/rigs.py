@@ -146,9 +146,8 @@ def film(
     `colours`: the photos themselves are there, too, as of drones with a camera in colours.
     """
     told = json.loads((flight / "truth" / "truth.json").read_text())
-    lens = dict(told["cameras"]["visible"])
-    lens.pop("readout")
-    flown = Camera(**{k: (float(v) if k not in ("width", "height") else v) for k, v in lens.items()})
+    lens = {k: v for k, v in told["cameras"]["visible"].items() if k not in ("readout", "fisheye")}
+    flown = Camera(**lens)
     focal = 1.12 * flown.focal * size[0] / flown.width
     cameras = rig(seed, *size, focal, bends=bends)
     folder.mkdir(parents=True)
@@ -167,9 +166,7 @@ def film(
             xmp = xmp_of(photo, band, f"capture-{shot:04d}", focal, said)
             exif[700] = xmp.encode()
             short = "".join(part[0] for part in band.name.upper().split())
-            Image.fromarray(pixels).save(
-                folder / f"MS_{shot:04d}_{short}.TIF", exif=exif
-            )
+            Image.fromarray(pixels).save(folder / f"MS_{shot:04d}_{short}.TIF", exif=exif)
         if colours:
             (folder / f"MS_{shot:04d}_D.JPG").write_bytes(photo.read_bytes())
     return cameras

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from skyquilt.thermal.page import thermal_section, with_section
+from skyquilt.report.page import with_section
+from skyquilt.thermal.page import thermal_section
 
 RECORD = {
     "route": "heights",

@@ -107,6 +107,15 @@ def command(
             default="that of most photos",
         ),
     ] = None,
+    all_bands: Annotated[
+        bool,
+        option(
+            INPUT,
+            "Draw all bands of such cameras in bands.tif, on the map's grid, and indices of"
+            " vegetation (ndvi.tif ...).",
+            "--all-bands",
+        ),
+    ] = False,
     lever_arm: Annotated[
         str | None,
         option(
@@ -340,9 +349,12 @@ def command(
         ("--overwrite", overwrite),
         ("--rerun-from", rerun_from is not None),
         ("--thermal", thermal is not None),
+        ("--all-bands", all_bands),
     ):
         if add and given:
             raise UsageError(f"--add and {other} exclude one another")
+    if all_bands and thermal is not None:
+        raise UsageError("--all-bands and --thermal exclude one another")
     source = source_of(photos)
     mode = mode_of(quiet=quiet, json=json, verbose=verbose)
     exporting = _exporting(export, output)
@@ -402,9 +414,16 @@ def command(
             raise UsageError(
                 f"--thermal-route {thermal_route!r} needs --thermal, a folder of photos"
             )
-        events = iter_mosaic(
-            source, output, settings, overwrite=overwrite, rerun_from=rerun_from, add=add
-        )
+        if all_bands:
+            from skyquilt.multispectral.workflow import iter_bands
+
+            events = iter_bands(
+                source, output, settings, overwrite=overwrite, rerun_from=rerun_from
+            )
+        else:
+            events = iter_mosaic(
+                source, output, settings, overwrite=overwrite, rerun_from=rerun_from, add=add
+            )
     else:
         from skyquilt.thermal.workflow import iter_thermal
 
@@ -421,7 +440,8 @@ def command(
         )
     advice = "the same command resumes, with --memory smaller or --max-memory larger"
     with ends_run(limit_bytes(max_memory), advice):
-        show(events, mode=mode, summary=None if thermal is None else with_thermal)
+        summary = with_thermal if thermal is not None else with_bands if all_bands else None
+        show(events, mode=mode, summary=summary)
         if exporting is not None:
             show_exports(exporting(), mode=mode)
 
@@ -454,6 +474,19 @@ def with_thermal(result: "Result") -> str:
     return (
         f"{mosaic_summary(result)}\nthermal: {result.output / 'thermal.tif'} ({t['photos_used']} of"
         f" {t['photos_total']} photos, placed by {how})"
+    )
+
+
+def with_bands(result: "Result") -> str:
+    """A mosaic in a few lines, and the bands beside it."""
+    from skyquilt.cli.progress import mosaic_summary
+
+    told = result.metrics["bands"]
+    names = ", ".join(b["name"] for b in told["shown"])
+    indices = "".join(f", {name}.tif" for name in told["indices"])
+    return (
+        f"{mosaic_summary(result)}\nbands:  {result.output / 'bands.tif'} ({names}; values:"
+        f" {told['values']}){indices}"
     )
 
 

@@ -41,6 +41,10 @@ STATE, EXPORTS, LOCK = ".skyquilt", "export", "run.lock"
 FILES = {
     "mosaic.tif": "map",
     "thermal.tif": "thermal map",
+    "bands.tif": "all bands",
+    "ndvi.tif": "NDVI",
+    "ndre.tif": "NDRE",
+    "gndvi.tif": "GNDVI",
     "dsm.tif": "heights",
     "hillshade.tif": "relief",
     "dtm.tif": "bare ground",
@@ -56,8 +60,10 @@ FILES = {
     "run.toml": "settings",
 }
 """Files of a run, in the order of the links."""
-LASTING = tuple(name for name in FILES if name not in ("metrics.json", "thermal.tif"))
-"""Those that nothing changes once the run is finished; a thermal map is added afterwards."""
+ADDED = ("thermal.tif", "bands.tif", "ndvi.tif", "ndre.tif", "gndvi.tif")
+"""Those that are added to a finished run."""
+LASTING = tuple(name for name in FILES if name not in ("metrics.json", *ADDED))
+"""Those that nothing changes once the run is finished."""
 PART, PARTS = 1 << 14, 256
 """Bytes of a part of a file, and how many parts tell whether it is whole."""
 

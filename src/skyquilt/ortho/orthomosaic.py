@@ -233,7 +233,7 @@ class Drawing:
         beside.
         """
         compose = self.compose
-        keep, table = _keeper(compose, self.alignment, self.boundary), shot_numbers(compose)
+        keep, table = keeper(compose, self.alignment, self.boundary), shot_numbers(compose)
 
         def drawn(block: Block) -> tuple[NDArray[Any], NDArray[np.bool_], BlockExtras]:
             composed = compose(_window(block))
@@ -276,9 +276,10 @@ def _window(block: Block) -> Window:
     return Window(row=block.row0, column=block.col0, height=block.height, width=block.width)
 
 
-def _keeper(
+def keeper(
     compose: Composer, alignment: Alignment, boundary: Path | None
 ) -> Callable[[Block], NDArray[np.bool_]] | None:
+    """Tells of a block which of its pixels (h, w) lie inside a boundary; None without one."""
     if boundary is None or alignment.frame.crs is None:
         return None
     from skyquilt.raster.boundary import inside as inside_polygon

@@ -7,11 +7,37 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Palette = Literal["heat", "heights", "counts", "numbers"]
-"""Colours of measured values, of heights, of how many photos see a place, of which photo shows
-it.
+Palette = Literal["heat", "heights", "counts", "plants", "numbers"]
+"""Colours of measured values, of heights, of how many photos see a place, of indices of vegetation,
+of which photo shows it.
 """
-MAPS = {"heat": cv2.COLORMAP_INFERNO, "heights": cv2.COLORMAP_TURBO, "counts": cv2.COLORMAP_VIRIDIS}
+_PLANTS = (
+    (0.0, "#7a3b10"),
+    (0.3, "#d9b066"),
+    (0.5, "#f5f0c0"),
+    (0.75, "#7fbf5a"),
+    (1.0, "#0b5a2b"),
+)
+"""Share of the range and colour: bare ground brown, plants green."""
+
+
+def _between(stops: Sequence[tuple[float, str]]) -> NDArray[np.uint8]:
+    """(256, 1, 3) BGR, straight lines between colours `#rrggbb`."""
+    at = np.linspace(0, 1, 256)
+    shares = [share for share, _ in stops]
+    bands = [
+        np.interp(at, shares, [int(colour[k : k + 2], 16) for _, colour in stops])
+        for k in (5, 3, 1)
+    ]
+    return np.rint(np.stack(bands, -1)).astype(np.uint8)[:, None]
+
+
+MAPS: dict[str, Any] = {
+    "heat": cv2.COLORMAP_INFERNO,
+    "heights": cv2.COLORMAP_TURBO,
+    "counts": cv2.COLORMAP_VIRIDIS,
+    "plants": _between(_PLANTS),
+}
 NUMBERED = np.array(
     [[(37 * k) % 200 + 40, (91 * k + 80) % 200 + 40, (151 * k + 30) % 200 + 40] for k in range(61)],
     np.uint8,

@@ -145,3 +145,17 @@ def _template(name: str = "page.html.j2") -> Template:
 @cache
 def _asset(name: str) -> Markup:
     return Markup((HERE / name).read_text(encoding="utf-8"))  # our own files, not user text
+
+
+_BEGIN, _END = "<!-- other spectrum -->", "<!-- /other spectrum -->"
+
+
+def with_section(page: str, section: Section) -> str:
+    """A finished report with this section at its end; a former one is replaced."""
+    body = f"{_BEGIN}\n{section_html(section)}\n{_END}"
+    found = re.search(f"{re.escape(_BEGIN)}.*?{re.escape(_END)}", page, re.DOTALL)
+    return (
+        page[: found.start()] + body + page[found.end() :]
+        if found
+        else page.replace("</main>", f"{body}\n</main>", 1)
+    )

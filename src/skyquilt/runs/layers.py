@@ -43,6 +43,9 @@ class RunLayer:
 LAYERS = (
     RunLayer(name="mosaic", title="Map", file="mosaic.tif"),
     RunLayer(name="thermal", title="Thermal", file="thermal.tif", measured=True),
+    RunLayer(name="ndvi", title="NDVI", file="ndvi.tif", palette="plants", measured=True),
+    RunLayer(name="ndre", title="NDRE", file="ndre.tif", palette="plants", measured=True),
+    RunLayer(name="gndvi", title="GNDVI", file="gndvi.tif", palette="plants", measured=True),
     RunLayer(name="heights", title="Heights", file="dsm.tif", palette="heights", measured=True),
     RunLayer(name="hillshade", title="Hillshade", file="hillshade.tif"),
     RunLayer(name="ground", title="Bare ground", file="dtm.tif", palette="heights", measured=True),
@@ -102,6 +105,8 @@ def unit_of(layer: RunLayer, figures: Mapping[str, Any]) -> str:
     told = told if isinstance(told, Mapping) else {}
     of_values = told.get("thermal_values") or {}
     unit = told.get("unit") or (of_values.get("unit") if isinstance(of_values, Mapping) else "")
+    if layer.palette == "plants":
+        return ""
     return {"views": "photos", "provenance": ""}.get(
         layer.name, UNITS.get(str(unit), "" if unit is None else str(unit))
     )

@@ -3,7 +3,6 @@ the report.
 """
 
 import json
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +19,7 @@ from skyquilt.raster.atomic import whole_file, write_text
 from skyquilt.report.images import shrunk
 from skyquilt.report.layers import value_legend
 from skyquilt.report.numbers import DASH, fixed, mapping, number, plain
-from skyquilt.report.page import section_html, write_page
+from skyquilt.report.page import with_section, write_page
 from skyquilt.report.parts import UNITS, Block, Section, Sentences, Table
 
 OVERLAYS = ("thermal_checkerboard.png", "thermal_false_colour.png", "thermal_alpha.png")
@@ -116,7 +115,6 @@ _CAPTIONS = (
     ),
     ("Thermal over visual", "The thermal map in warm colours, half transparent."),
 )
-_BEGIN, _END = "<!-- other spectrum -->", "<!-- /other spectrum -->"
 
 
 def thermal_section(
@@ -173,15 +171,4 @@ def _refused(record: Mapping[str, Any]) -> list[Block]:
     refused = mapping(record.get("routes_refused"))
     return (
         [Sentences(items=tuple(f"Not by {k}: {v}." for k, v in refused.items()))] if refused else []
-    )
-
-
-def with_section(page: str, section: Section) -> str:
-    """A finished report with this section at its end; a former one is replaced."""
-    body = f"{_BEGIN}\n{section_html(section)}\n{_END}"
-    found = re.search(f"{re.escape(_BEGIN)}.*?{re.escape(_END)}", page, re.DOTALL)
-    return (
-        page[: found.start()] + body + page[found.end() :]
-        if found
-        else page.replace("</main>", f"{body}\n</main>", 1)
     )

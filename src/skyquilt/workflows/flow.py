@@ -285,13 +285,13 @@ def draw_map(
     exposure = yield from clock.stage(
         "balance",
         apart(
-            lambda tell: _exposure(aligned, on, methods, settings.picture, clock.store, tell),
+            lambda tell: exposure_of(aligned, on, methods, settings.picture, clock.store, tell),
             CountedParts(),
         ),
     )
     labels, labelled = yield from clock.stage(
         "seams",
-        apart(lambda tell: _labels(aligned, on, exposure, methods, clock, tell), CountedParts()),
+        apart(lambda tell: labels_of(aligned, on, exposure, methods, clock, tell), CountedParts()),
     )
     make_room(aligned.found, aligned.grey, aligned.links)
     parts = None
@@ -327,7 +327,7 @@ def _drawn(
     return drawing.companions()
 
 
-def _exposure(
+def exposure_of(
     aligned: AlignedPhotos,
     on: Ground,
     methods: Methods,
@@ -352,7 +352,7 @@ def _exposure(
     return store.get_or("balance", key, lambda: levelled(on))
 
 
-def _labels(
+def labels_of(
     aligned: AlignedPhotos,
     on: Ground,
     exposure: Exposure,

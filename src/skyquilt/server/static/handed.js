@@ -67,7 +67,7 @@ const readFiles = async () => {
     li.append(a, element("small", `${f.name}, ${inSize(f.bytes)}`));
     return li;
   };
-  const main = ["mosaic.tif", "dsm.tif", "thermal.tif", "report.html"];
+  const main = ["mosaic.tif", "dsm.tif", "thermal.tif", "bands.tif", "ndvi.tif", "report.html"];
   $("downloads").replaceChildren(...main.map((n) => files.find((f) => f.name === n)).filter(Boolean).map(row));
   const rest = files.filter((f) => !main.includes(f.name));
   $("more").hidden = !rest.length;

@@ -1,0 +1,121 @@
+"""The files of a multispectral camera, by band and by the capture that they belong to."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.errors import UnreadablePhotoError
+from skyquilt.model.photo import Photo
+from skyquilt.multispectral.reflectance import Kind, Reflectance, common_kind, smoothed_irradiance
+from skyquilt.photos.band_tags import BandTags, canonical, read_band_tags
+from skyquilt.photos.together import taken_together
+
+THERMAL = "lwir"
+"""The band of temperatures, which says nothing of reflectance."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BandFiles:
+    """The files of one band."""
+
+    name: str
+    """Its name, one of `photos.band_tags.canonical` where it is known."""
+    photos: tuple[Photo, ...]
+    """Its files."""
+    tags: tuple[BandTags, ...]
+    """What each tells of itself."""
+    converts: tuple[Reflectance, ...] = field(default=())
+    """How the counts of each become values."""
+
+    @cached_property
+    def wavelength_nm(self) -> float | None:
+        """Wavelength at its centre in nm; None where no file tells it."""
+        told = [t.wavelength_nm for t in self.tags if t.wavelength_nm is not None]
+        return float(np.median(told)) if told else None
+
+    @property
+    def kind(self) -> Kind:
+        """What the values of all its files can be taken for."""
+        return common_kind(self.converts)
+
+    def as_kind(self, kind: Kind) -> "BandFiles":
+        """The band with values of a weaker kind."""
+        return replace(self, converts=tuple(c.as_kind(kind) for c in self.converts))
+
+
+def bands_of_files(photos: Sequence[Photo]) -> tuple[BandFiles, ...]:
+    """The bands that files show, in order of wavelength. The irradiance of each photo is that of
+    the sun sensor, smoothed over the flight.
+    """
+    named: dict[str, list[tuple[Photo, BandTags]]] = {}
+    for photo in photos:
+        tags = tags_of(photo)
+        name = canonical(photo.band_name or tags.name, tags.wavelength_nm)
+        named.setdefault(name or "band", []).append((photo, tags))
+    found = [
+        BandFiles(
+            name=name,
+            photos=tuple(p for p, _ in files),
+            tags=tuple(t for _, t in files),
+            converts=_converting(files),
+        )
+        for name, files in named.items()
+    ]
+    unknown = 1e9
+    return tuple(sorted(found, key=lambda b: b.wavelength_nm or _USUAL.get(b.name, unknown)))
+
+
+_USUAL = {
+    "blue": 475.0,
+    "green": 560.0,
+    "red": 668.0,
+    "red edge": 717.0,
+    "nir": 842.0,
+    "panchro": 635.0,
+    THERMAL: 11_000.0,
+}
+"""Usual wavelengths in nm, for the order of bands that tell none."""
+
+
+def tags_of(photo: Photo) -> BandTags:
+    """What a file tells of its band; only the name where it cannot be read any more."""
+    try:
+        return read_band_tags(photo.path)
+    except (UnreadablePhotoError, OSError):  # it is lost or damaged: told when it is drawn
+        return BandTags(name=photo.band_name)
+
+
+def _converting(files: Sequence[tuple[Photo, BandTags]]) -> tuple[Reflectance, ...]:
+    """How each file's counts become values, with the irradiance smoothed over the flight."""
+    found = [Reflectance.of(tags, photo.width, photo.height) for photo, tags in files]
+    times: NDArray[np.float64] = np.array(
+        [np.nan if p.time is None else p.time.replace(tzinfo=None).timestamp() for p, _ in files]
+    )
+    read = np.array([np.nan if c.irradiance is None else c.irradiance for c in found])
+    smooth = smoothed_irradiance(times, read)
+    return tuple(
+        c if np.isnan(light) else c.with_irradiance(float(light))
+        for c, light in zip(found, smooth, strict=True)
+    )
+
+
+def captured_together(
+    photos: Sequence[Photo], captures: Sequence[str], band: BandFiles
+) -> dict[int, int]:
+    """Index of the map's photo -> index of the band's file of the same capture: by what files tell
+    of their capture, else by their times and names. `captures`: what the map's photos tell.
+    """
+    known = {capture: i for i, capture in enumerate(captures) if capture}
+    found: dict[int, int] = {}
+    for j, tags in enumerate(band.tags):
+        if tags.capture in known:
+            found.setdefault(known[tags.capture], j)
+    left_a = [i for i in range(len(photos)) if i not in found]
+    taken = set(found.values())
+    left_b = [j for j in range(len(band.photos)) if j not in taken]
+    pairs = taken_together([photos[i] for i in left_a], [band.photos[j] for j in left_b])
+    found |= {left_a[i]: left_b[j] for i, j in pairs}
+    return found

@@ -1,0 +1,233 @@
+"""bands.tif: all bands on the map's grid, and a raster for each index of vegetation.
+
+In every band each place is shown from the same capture, that of the map, so that a quotient of
+bands compares pixels that were exposed together. Where a band's frame does not reach so far, it
+takes the capture that shows the place from most above.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.engine.clock import Steps
+from skyquilt.engine.folder import STATE
+from skyquilt.engine.pixel_cache import PixelCache
+from skyquilt.engine.workers import Workers
+from skyquilt.errors import PhotoFailedError
+from skyquilt.imaging.nodes import View
+from skyquilt.imaging.views import make_views
+from skyquilt.model.photo import Photo
+from skyquilt.model.poses import Alignment, Pose, no_ties
+from skyquilt.model.raster import Window
+from skyquilt.multispectral.captures import BandFiles
+from skyquilt.multispectral.indices import Index
+from skyquilt.multispectral.rig import BandRig
+from skyquilt.ortho.blend import Blend
+from skyquilt.ortho.companions import geotransform
+from skyquilt.ortho.compose import Composer
+from skyquilt.ortho.ground import Ground
+from skyquilt.ortho.labels import Labels
+from skyquilt.ortho.orthomosaic import keeper
+from skyquilt.photos.pixels import lost, read_color
+from skyquilt.photos.read import rejected
+from skyquilt.raster import Block, CogWriter, RasterSpec
+
+BANDS_FILE = "bands.tif"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlacedBand:
+    """A band whose files are placed."""
+
+    files: BandFiles
+    """Its files."""
+    of_photo: dict[int, int]
+    """Index of the map's photo -> index of the file of the same capture."""
+    rig: BandRig | None
+    """Its camera beside that of the map's photos; None = the map's photos are its files."""
+
+    def without(self, name: str) -> "PlacedBand":
+        """The band without a file that cannot be read."""
+        kept = {i: j for i, j in self.of_photo.items() if self.files.photos[j].name != name}
+        return replace(self, of_photo=kept)
+
+
+def aligned_band(band: PlacedBand, placed: Alignment) -> Alignment:
+    """The poses of a band's files, by the indices of the map's photos."""
+    of_photo = [i for i in band.of_photo if i in placed.poses]
+    if band.rig is None:
+        return replace(placed, poses={i: placed.poses[i] for i in of_photo})
+    rotation = band.rig.b_R_a
+    poses = {
+        i: Pose(cam_R_map=rotation @ placed.poses[i].cam_R_map, map_C=placed.poses[i].map_C)
+        for i in of_photo
+    }
+    return Alignment(
+        method="rig",
+        why="its camera is beside that of the map's photos",
+        frame=placed.frame,
+        poses=poses,
+        cameras={band.files.name: band.rig.camera},
+        camera_of=dict.fromkeys(poses, band.files.name),
+        blocks=(tuple(poses),),
+        ties=no_ties(),
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BandsDrawing:
+    """The rasters of bands and indices while they are drawn; a killed run goes on at its block."""
+
+    output: Path
+    """Folder of the files."""
+    bands: Sequence[PlacedBand]
+    """The bands, in the order of the file."""
+    indices: Sequence[Index]
+    """The indices that are drawn, too."""
+    ground: Ground
+    """Heights, grid and what the map's photos may show."""
+    placed: Alignment
+    """The map's poses."""
+    labels: Labels | None
+    """The capture shown at each place."""
+    blend: Blend
+    """How photos are joined."""
+    boundary: Path | None
+    """Polygon outside which the map is empty."""
+    pixels_bytes: int
+    """Bytes of decoded photos that may be kept."""
+    key: str
+    """What the rasters depend on."""
+    tags: dict[str, str]
+    """Metadata of the files."""
+
+    def blocks(self, workers: Workers) -> Steps[None]:
+        """Writes the rasters.
+
+        Raises:
+            PhotoFailedError: a file cannot be read any more. OutputError: the disk is full.
+        """
+        one = self._block()
+        with ExitStack() as stack:
+            main = stack.enter_context(self._writer(BANDS_FILE, self._spec(None)))
+            others = [
+                stack.enter_context(self._writer(f"{i.name}.tif", self._spec(i)))
+                for i in self.indices
+            ]
+            left = [{_corner(b) for b in writer.blocks()} for writer in (main, *others)]
+            todo = [b for b in _all(main, others) if any(_corner(b) in some for some in left)]
+            for done, (block, pixels) in enumerate(zip(todo, workers.each(one, todo), strict=True)):
+                for writer, some, values in zip((main, *others), left, pixels, strict=True):
+                    if _corner(block) in some:
+                        writer.write_block(block, values, np.isfinite(values).any(2))
+                yield done + 1, len(todo)
+
+    def _writer(self, name: str, spec: RasterSpec) -> CogWriter:
+        spool = self.output / STATE / f"{name}.spool"
+        return CogWriter(self.output / name, spec, spool=spool, digest=self.key)
+
+    def _spec(self, index: Index | None) -> RasterSpec:
+        grid, files = self.ground.grid, [b.files for b in self.bands]
+        units = tuple(f.photos[0].unit for f in files)
+        return RasterSpec(
+            width=grid.width,
+            height=grid.height,
+            bands=1 if index else len(files),
+            dtype="float32",
+            transform=geotransform(grid, self.placed),
+            crs=self.placed.frame.crs,
+            compress="deflate",
+            nodata=float("nan"),
+            band_names=(index.title,) if index else tuple(f.name for f in files),
+            band_units=() if index or not any(units) else units,
+            tags={"SOFTWARE": "Skyquilt", **self.tags},
+        )
+
+    def _block(self) -> Callable[[Block], list[NDArray[np.float32]]]:
+        composers = [self._composer(b) for b in self.bands]
+        keep = keeper(composers[0], self.placed, self.boundary)
+        names = [b.files.name for b in self.bands]
+
+        def drawn(block: Block) -> list[NDArray[np.float32]]:
+            window = Window(
+                row=block.row0, column=block.col0, height=block.height, width=block.width
+            )
+            values = np.concatenate([_whole(c, window) for c in composers], axis=2)
+            if keep is not None:
+                values[~keep(block)] = np.nan
+            band = dict(zip(names, np.moveaxis(values, 2, 0), strict=True))
+            return [values, *(i(band[i.a], band[i.b])[..., None] for i in self.indices)]
+
+        return drawn
+
+    def _composer(self, band: PlacedBand) -> Composer:
+        photos, of_photo, converts = band.files.photos, band.of_photo, band.files.converts
+
+        def read(i: int) -> NDArray[Any]:
+            values = _pixels(photos[of_photo[i]])
+            return values if photos[of_photo[i]].unit else converts[of_photo[i]](values)
+
+        share = self.pixels_bytes // len(self.bands)
+        return Composer(
+            grid=self.ground.grid,
+            views=self._views(band),
+            surface=self.ground.surface,
+            blend=self.blend,
+            pixels=PixelCache(read=read, budget_bytes=share),
+            bands=1,
+            dtype=np.dtype(np.float32),
+            labels=self.labels,
+            detailed=True,
+        )
+
+    def _views(self, band: PlacedBand) -> list[View]:
+        if band.rig is None:
+            return [v for v in self.ground.views if v.photo in band.of_photo]
+        limits = replace(self.ground.limits, blanks={}, marks={})
+        return make_views(aligned_band(band, self.placed), self.ground.surface, limits)
+
+
+def _whole(compose: Composer, window: Window) -> NDArray[np.float32]:
+    """A window (h, w, 1) of a band, with what the capture of the map does not show from others."""
+    composed = compose(window)
+    values, empty = composed.pixels, composed.photo < 0
+    if compose.labels is not None and empty.any():
+        more = replace(compose, labels=None)(window).pixels
+        values[empty] = more[empty]
+    return np.asarray(values, np.float32)
+
+
+def _corner(block: Block) -> tuple[int, int]:
+    return block.row0, block.col0
+
+
+def _all(main: CogWriter, others: Sequence[CogWriter]) -> Iterator[Block]:
+    """The blocks that any of the writers lacks, each once; all have the same blocks."""
+    seen: set[tuple[int, int]] = set()
+    for writer in (main, *others):
+        for block in writer.blocks():
+            if _corner(block) not in seen:
+                seen.add(_corner(block))
+                yield block
+
+
+def _pixels(photo: Photo) -> NDArray[Any]:
+    """Values (h, w) of a file of one band.
+
+    Raises:
+        PhotoFailedError: it cannot be read any more.
+    """
+    try:
+        pixels = read_color(photo)
+        if reason := lost(photo):
+            raise PhotoFailedError(photo.name, reason)
+    except PhotoFailedError:
+        raise
+    except Exception as error:  # whatever it is, it concerns this photo alone
+        raise PhotoFailedError(photo.name, rejected(photo.name, error).reason) from error
+    return np.asarray(pixels[..., 0] if pixels.ndim == 3 else pixels)

@@ -1,0 +1,185 @@
+"""What the bands add to a finished run: figures, and a section of the report with pictures."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+
+from skyquilt.coregistration.page import picture
+from skyquilt.model.photo import RejectedPhoto
+from skyquilt.multispectral.draw import BANDS_FILE, PlacedBand
+from skyquilt.multispectral.indices import INDICES, Index
+from skyquilt.raster.atomic import write_text
+from skyquilt.raster.colours import coloured
+from skyquilt.report.numbers import DASH, fixed, number, plain
+from skyquilt.report.page import with_section, write_page
+from skyquilt.report.parts import Block, Section, Sentences, Table
+
+LONGEST = 1000
+"""Longer side in px of pictures in the page."""
+_VALUES = {
+    "reflectance": "Values are reflectances, 0 to 1, by the camera's calibration and its sun"
+    " sensor.",
+    "relative": "Values are proportional to reflectance, with one factor for all bands, by the"
+    " camera's calibration and its sun sensor.",
+    "by-band": "Values are proportional to reflectance, with a factor of each band's own that files"
+    " do not tell: indices compare places of this map, not this map with others.",
+    "radiance": "Values are proportional to the light that came from the ground: the files tell no"
+    " usable irradiance, so indices depend on the light of the day.",
+    "counts": "Values are counts as recorded: the files do not tell how they came about, so indices"
+    " are not comparable with those of other maps.",
+}
+_COMPOSITES = (
+    (
+        ("nir", "red", "green"),
+        "Colour infrared",
+        "Near infrared, red and green as red, green and blue: plants are red.",
+    ),
+    (("red", "green", "blue"), "Colours", "Red, green and blue bands, each stretched."),
+)
+
+
+def band_figures(
+    bands: Sequence[PlacedBand],
+    refused: Mapping[str, str],
+    lost: Sequence[RejectedPhoto],
+    kind: str,
+    indices: Sequence[Index],
+) -> dict[str, Any]:
+    """The entry `bands` of metrics.json."""
+    return {
+        "values": kind,
+        "shown": [_figures(b) for b in bands],
+        "refused": dict(refused),
+        "indices": [i.name for i in indices],
+        "photos_rejected": {p.name: p.reason for p in lost},
+        "notes": sorted({n for b in bands for c in b.files.converts for n in c.notes}),
+    }
+
+
+def _figures(band: PlacedBand) -> dict[str, Any]:
+    """Figures of one band; those of the camera are null where it is the map's own."""
+    rig, files = band.rig, band.files
+    saved = {
+        "name": files.name,
+        "wavelength_nm": files.wavelength_nm,
+        "unit": files.photos[0].unit,
+        "photos": len(band.of_photo),
+        "photos_total": len(files.photos),
+    }
+    if rig is None:
+        return {**saved, "band_R_map_photo": None, "focal_px": None, "off_px": None, "agree": None}
+    return {
+        **saved,
+        "band_R_map_photo": rig.b_R_a.tolist(),
+        "focal_px": round(rig.camera.focal, 2),
+        "off_px": round(rig.off_px, 3) if np.isfinite(rig.off_px) else None,
+        "agree": round(rig.share, 3),
+    }
+
+
+def write_bands(output: Path, visual: Mapping[str, Any], figures: Mapping[str, Any]) -> None:
+    """Adds a section to the report, and the figures to metrics.json."""
+    page = output / "report.html"
+    if page.is_file():
+        section = bands_section(figures["bands"], pictures_of(output))
+        write_page(page, with_section(page.read_text(encoding="utf-8"), section))
+    write_text(
+        output / "metrics.json", json.dumps({**visual, **figures}, indent=1, allow_nan=False)
+    )
+
+
+def pictures_of(output: Path) -> list[tuple[NDArray[np.uint8], str, str]]:
+    """RGB (h, w, 3), title and caption of each picture in the page."""
+    found = []
+    with rasterio.open(output / BANDS_FILE) as source:
+        names = [name or "" for name in source.descriptions]
+        small = _small(source)
+    for wanted, title, caption in _COMPOSITES:
+        if set(wanted) <= set(names):
+            found.append((_composite([small[names.index(n)] for n in wanted]), title, caption))
+    for index in INDICES:
+        if {index.a, index.b} <= set(names):
+            values = index(small[names.index(index.a)], small[names.index(index.b)])
+            found.append(_index_picture(values, index))
+    return found
+
+
+def _small(source: Any) -> NDArray[np.float32]:
+    """All bands (n, h, w) reduced to the page's size."""
+    factor = max(1.0, max(source.width, source.height) / LONGEST)
+    size = (
+        source.count,
+        max(1, round(source.height / factor)),
+        max(1, round(source.width / factor)),
+    )
+    return np.asarray(source.read(out_shape=size), np.float32)
+
+
+def _composite(bands: Sequence[NDArray[np.float32]]) -> NDArray[np.uint8]:
+    out = []
+    for values in bands:
+        known = np.isfinite(values)
+        low, high = np.percentile(values[known], [1, 99]) if known.any() else (0.0, 1.0)
+        # the eye is used to pictures that are brighter in the dark
+        share = np.clip((values - low) / max(float(high - low), 1e-9), 0, 1) ** (1 / 1.8)
+        out.append(np.where(known, np.nan_to_num(share) * 255, 255))
+    return np.rint(np.stack(out, -1)).astype(np.uint8)
+
+
+def _index_picture(values: NDArray[np.float32], index: Index) -> tuple[NDArray[np.uint8], str, str]:
+    known = np.isfinite(values)
+    low, high = np.percentile(values[known], [2, 98]) if known.any() else (-1.0, 1.0)
+    rgb = coloured(np.nan_to_num(values)[..., None], (float(low), float(high)), "plants")
+    rgb[~known] = 255
+    bright, dark = index.a, index.b
+    return (
+        np.ascontiguousarray(rgb),
+        index.title,
+        f"({bright} - {dark}) / ({bright} + {dark}), {fixed(low, 2)} (brown) to {fixed(high, 2)}"
+        " (green).",
+    )
+
+
+def bands_section(
+    record: Mapping[str, Any], pictures: Sequence[tuple[NDArray[np.uint8], str, str]]
+) -> Section:
+    """The section from the entry `bands` of metrics.json, and its pictures."""
+    blocks: list[Block] = [_table(record["shown"]), *(picture(*p) for p in pictures)]
+    said = [f"The band {n} is left out: {why}." for n, why in record["refused"].items()]
+    said += [f"{n} is left out: {why}." for n, why in record["photos_rejected"].items()]
+    said += record["notes"]
+    if said:
+        blocks.append(Sentences(items=tuple(said)))
+    return Section(
+        id="bands", title="Bands", lead=_VALUES[str(record["values"])], blocks=tuple(blocks)
+    )
+
+
+def _table(shown: Sequence[Mapping[str, Any]]) -> Table:
+    def cell(value: Any, digits: int) -> str:
+        return DASH if number(value) is None else fixed(value, digits)
+
+    rows = tuple(
+        (
+            plain(b["name"]),
+            cell(b["wavelength_nm"], 0),
+            f"{b['photos']} of {b['photos_total']}",
+            cell(b["off_px"], 2),
+            cell(None if b["agree"] is None else 100 * b["agree"], 0),
+        )
+        for b in shown
+    )
+    return Table(
+        title="Bands of bands.tif",
+        head=("band", "wavelength, nm", "photos", "off, px", "patches that agree, %"),
+        rows=rows,
+        numeric="tntnn",
+        note="Off: median distance of patches of half of the captures from where the camera found"
+        " from the other half has them, scatter of the matches included. A dash: the map's own"
+        " band.",
+    )
