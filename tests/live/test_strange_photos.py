@@ -34,13 +34,26 @@ def test_one_band_of_a_multispectral_camera_is_mapped(tmp_path, asked, shown):
         told = {n: live.intake.take([b], n, "drone") for n, b in shots(2 + part)}
         live.close()
     taken = {n for n, t in told.items() if isinstance(t, Accepted)}
-    assert taken == {f"{shot}_{shown}.jpg" for shot in range(3)} | {"colour.jpg"}
+    assert taken == {f"{shot}_{shown}.jpg" for shot in range(3)}
     other = told["1_1.jpg"]
     assert isinstance(other, Refused)
     assert (
         other.reason
         == f"it shows the band green; the map shows {['blue', '', 'nir'][shown]} (--band)"
     )
+
+
+def test_photos_in_colours_that_come_first_are_mapped_without_bands(tmp_path):
+    """As drones write them that have a camera in colours beside those of the bands."""
+    live = LiveMap(tmp_path / "out", LiveSettings())
+    photos = [("colour.jpg", jpeg_bytes(pixels(seed=99))), *shots(1)]
+    told = {n: live.intake.take([b], n, "drone") for n, b in dict(photos).items()}
+    notes = live.ledger.rows("select body from event where kind = 'note'")
+    live.close()
+    assert {n for n, t in told.items() if isinstance(t, Accepted)} == {"colour.jpg"}
+    assert isinstance(told["0_0.jpg"], Refused)
+    assert "the map shows the photos in colours (--band)" in told["0_0.jpg"].reason
+    assert not any("came first" in body for (body,) in notes)
 
 
 @pytest.mark.parametrize("tone", [3, 252])

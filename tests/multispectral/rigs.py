@@ -17,7 +17,7 @@ from skyquilt.model.camera import Camera
 
 BANDS = {"blue": 475, "green": 560, "red": 650, "red edge": 730, "nir": 860}
 """Centres of the bands in nm."""
-BLACK, FULL = 3200, 65535
+BLACK, FULL, NODE = 3200, 65535, 8
 VIGNETTING = (1.0e-5, 3.0e-7, 0.0, 0.0, 0.0, 0.0)
 """Coefficients of r to r^6 (r in px) of the polynomial that undoes the loss of light."""
 
@@ -82,9 +82,17 @@ def reflectance(rgb: np.ndarray, name: str) -> np.ndarray:
 def seen(share: np.ndarray, flown: Camera, band: BandCamera) -> np.ndarray:
     """What a camera of the rig sees of a picture that the flight's camera took."""
     R, lens = rotation_from_vector(band.turn), band.camera
-    x, y = np.meshgrid(np.arange(lens.width, dtype=float), np.arange(lens.height, dtype=float))
+    # lenses bend little over a few pixels
+    across, down = (np.arange(0, n + NODE, NODE, dtype=float) for n in (lens.width, lens.height))
+    x, y = np.meshgrid(across, down)
     px = project(flown, rays(lens, np.c_[x.ravel(), y.ravel()]) @ R).astype(np.float32)
-    u, v = (np.ascontiguousarray(p) for p in px.reshape(*x.shape, 2).transpose(2, 0, 1))
+    at = np.meshgrid(
+        *(np.arange(n, dtype=np.float32) / NODE for n in (lens.width, lens.height))
+    )
+    u, v = (
+        cv2.remap(np.ascontiguousarray(p), *at, cv2.INTER_LINEAR)
+        for p in px.reshape(*x.shape, 2).transpose(2, 0, 1)
+    )
     return cv2.remap(share, u, v, cv2.INTER_LINEAR)
 
 

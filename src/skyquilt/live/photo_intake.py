@@ -154,7 +154,7 @@ class Intake:
             known = self.ledger.row("select id, name from photo where digest = ?", arrived.digest)
             if known is not None:
                 return Accepted(id=int(known[0]), name=str(known[1]), duplicate=True)
-            if photo.shows_a_band and (reason := photo.other_band(self._band(photo))):
+            if reason := self._of_other_band(photo):
                 gone(arrived.path)
                 return self.refuse(name, source, reason)
             same = self.ledger.rows(
@@ -192,18 +192,22 @@ class Intake:
         hit("photo row committed")
         return Accepted(id=number, name=name)
 
-    def _band(self, photo: Photo) -> str:
-        """The band of multispectral cameras that the map shows: as asked, or the first to arrive. A
-        map of all would be a patchwork of them.
+    def _of_other_band(self, photo: Photo) -> str:
+        """The reason why the map leaves a photo out that shows another band than it does, or
+        colours; empty for others. It shows the band that is asked for, or what came first: a map of
+        all would be a patchwork of them.
         """
+        if not (photo.in_colours or photo.shows_a_band):
+            return ""
         asked = self.settings.band
         shown = self.ledger.meta("band") if asked is None else asked.lower()
         if shown is None:
-            shown = photo.band_name
+            shown = photo.band_name if photo.shows_a_band else ""
             self.ledger.put_meta("band", shown)
-            text = f"files of the band {shown} came first: the map shows it, and no other (--band)"
-            self.ledger.tell("note", {"text": text})
-        return str(shown)
+            if shown:
+                text = f"files of the band {shown} came first: the map shows it, and no other"
+                self.ledger.tell("note", {"text": f"{text} (--band)"})
+        return photo.other_band(str(shown))
 
 
 def shot_of(photo: Photo) -> str:

@@ -230,10 +230,17 @@ class Photo:
         """Whether the file shows one band of a multispectral camera."""
         return bool(self.band_name) and self.channels == 1
 
+    @property
+    def in_colours(self) -> bool:
+        """Whether it shows the colours that the eye sees."""
+        return self.channels == 3 and self.band == "visible"
+
     def other_band(self, shown: str) -> str:
         """The reason why a map of the band `shown` (empty: of photos in colours) leaves the file
-        out; empty if it shows it too, or is no file of one band.
+        out; empty if it shows it too, or is of one channel and names no band.
         """
+        if shown and self.in_colours:
+            return f"it is in colours; the map shows the band {shown} (--band)"
         if not self.shows_a_band or self.band_name == shown:
             return ""
         instead = shown or "the photos in colours"

@@ -121,9 +121,8 @@ def _small(source: Any) -> NDArray[np.float32]:
 
 
 def _composite(bands: Sequence[NDArray[np.float32]]) -> NDArray[np.uint8]:
-    out = []
+    out, known = [], np.isfinite(np.stack(bands)).all(0)
     for values in bands:
-        known = np.isfinite(values)
         low, high = np.percentile(values[known], [1, 99]) if known.any() else (0.0, 1.0)
         # the eye is used to pictures that are brighter in the dark
         share = np.clip((values - low) / max(float(high - low), 1e-9), 0, 1) ** (1 / 1.8)

@@ -226,9 +226,6 @@ def of_one_band(survey: Survey, wanted: str | None) -> Survey:
         return survey
     shown = wanted.lower() if wanted is not None else _usual(survey.photos)
     out = {p.name: reason for p in survey.photos if (reason := p.other_band(shown))}
-    if wanted is not None:
-        coloured = f"it is in colours; the map shows the band {shown} (--band)"
-        out |= {p.name: coloured for p in survey.photos if p.channels == 3}
     rejected = [RejectedPhoto(name=name, reason=reason) for name, reason in out.items()]
     return replace(
         survey,
@@ -258,7 +255,7 @@ _AS_MANY = 0.5
 
 def _in_colours(photos: Sequence[Photo]) -> bool:
     """Whether photos in colours are about as many as files of the commonest band."""
-    colours = sum(p.channels == 3 and p.band == "visible" for p in photos)
+    colours = sum(p.in_colours for p in photos)
     return colours > _AS_MANY * max(bands_of(photos).values(), default=0)
 
 
