@@ -86,9 +86,7 @@ def seen(share: np.ndarray, flown: Camera, band: BandCamera) -> np.ndarray:
     across, down = (np.arange(0, n + NODE, NODE, dtype=float) for n in (lens.width, lens.height))
     x, y = np.meshgrid(across, down)
     px = project(flown, rays(lens, np.c_[x.ravel(), y.ravel()]) @ R).astype(np.float32)
-    at = np.meshgrid(
-        *(np.arange(n, dtype=np.float32) / NODE for n in (lens.width, lens.height))
-    )
+    at = np.meshgrid(*(np.arange(n, dtype=np.float32) / NODE for n in (lens.width, lens.height)))
     u, v = (
         cv2.remap(np.ascontiguousarray(p), *at, cv2.INTER_LINEAR)
         for p in px.reshape(*x.shape, 2).transpose(2, 0, 1)
@@ -148,10 +146,12 @@ def film(
     bends: bool = True,
     colours: bool = False,
     irradiance_noise: float = 0.0,
+    shares=reflectance,
 ):
     """Writes a file for each band of each photo of a simulated flight; returns its cameras.
 
     `colours`: the photos themselves are there, too, as of drones with a camera in colours.
+    `shares` (rgb, name): what of the light ground gives back in a band.
     """
     told = json.loads((flight / "truth" / "truth.json").read_text())
     lens = {k: v for k, v in told["cameras"]["visible"].items() if k not in ("readout", "fisheye")}
@@ -168,7 +168,7 @@ def film(
         exif[271], exif[272] = "DJI", "Rig"
         light = 1 + 0.2 * np.sin(shot / 4)
         for band in cameras:
-            share = seen(reflectance(rgb, band.name), flown, band)
+            share = seen(shares(rgb, band.name), flown, band)
             pixels = counts(share, band, light)
             said = light * (1 + irradiance_noise * rng.normal())
             xmp = xmp_of(photo, band, f"capture-{shot:04d}", focal, said)

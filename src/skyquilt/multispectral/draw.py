@@ -224,10 +224,9 @@ def _pixels(photo: Photo) -> NDArray[Any]:
     """
     try:
         pixels = read_color(photo)
-        if reason := lost(photo):
-            raise PhotoFailedError(photo.name, reason)
-    except PhotoFailedError:
-        raise
     except Exception as error:  # whatever it is, it concerns this photo alone
-        raise PhotoFailedError(photo.name, rejected(photo.name, error).reason) from error
+        reason = lost(photo) or rejected(photo.name, error).reason
+        raise PhotoFailedError(photo.name, reason) from error
+    if reason := lost(photo):
+        raise PhotoFailedError(photo.name, reason)
     return np.asarray(pixels[..., 0] if pixels.ndim == 3 else pixels)

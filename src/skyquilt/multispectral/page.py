@@ -48,14 +48,14 @@ def band_figures(
     refused: Mapping[str, str],
     lost: Sequence[RejectedPhoto],
     kind: str,
-    indices: Sequence[Index],
+    indices: Sequence[str],
 ) -> dict[str, Any]:
     """The entry `bands` of metrics.json."""
     return {
         "values": kind,
         "shown": [_figures(b) for b in bands],
         "refused": dict(refused),
-        "indices": [i.name for i in indices],
+        "indices": list(indices),
         "photos_rejected": {p.name: p.reason for p in lost},
         "notes": sorted({n for b in bands for c in b.files.converts for n in c.notes}),
     }

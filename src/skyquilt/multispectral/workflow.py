@@ -7,14 +7,15 @@ The map's photos are aligned as those of any survey. The other cameras of the ri
 of their own: they were where the map's camera was, turned by an angle that never changes.
 """
 
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from skyquilt.engine.clock import Clock, Steps
-from skyquilt.engine.folder import STATE
+from skyquilt.engine.clock import Clock, Steps, result_of
+from skyquilt.engine.folder import STATE, stamp
 from skyquilt.engine.pixel_cache import pixel_budget
 from skyquilt.engine.store import Store, digest
 from skyquilt.engine.workers import Threads
@@ -31,22 +32,26 @@ from skyquilt.multispectral.captures import (
     captured_together,
     tags_of,
 )
-from skyquilt.multispectral.draw import BandsDrawing, PlacedBand
+from skyquilt.multispectral.draw import BANDS_FILE, BandsDrawing, PlacedBand
 from skyquilt.multispectral.indices import indices_of
 from skyquilt.multispectral.page import band_figures, write_bands
 from skyquilt.multispectral.reflectance import common_kind
 from skyquilt.multispectral.rig import BandRig, FindBandRig, Together
+from skyquilt.photos.headers import content_digest
 from skyquilt.photos.pixels import read_color
 from skyquilt.photos.read import ReadFiles
 from skyquilt.settings import MosaicSettings
 from skyquilt.typed import as_path, instance
+from skyquilt.version import __version__
 from skyquilt.workflows.artefacts import REGISTRY
 from skyquilt.workflows.flow import AlignedPhotos, Scene, exposure_of, labels_of, scene_of
 from skyquilt.workflows.mosaic import FinishedMap, make_map
 from skyquilt.workflows.survey_input import Source, SurveyInput, read_input
 
-MOST_PAIRS = 8
-"""Captures from which the camera of a band is found, distributed over the flight."""
+MOST_PAIRS = 6
+"""Captures from which the camera of a band is found, distributed over the flight; each takes two
+thirds of a second.
+"""
 LONGEST = 1600
 """Longest side in px of the pictures that are compared."""
 
@@ -99,12 +104,17 @@ def _bands(made: FinishedMap, others: Sequence[Photo]) -> Generator[Event, None,
     output, settings = made.result.output, made.settings
     store = Store(folder=output / STATE / "store", registry=REGISTRY)
     clock = Clock(store=store, began=Clock.now(), workers=Threads(settings.running.threads))
-    scene = yield from _quietly(scene_of(made.given, made.methods, settings, clock))
+    scene = result_of(scene_of(made.given, made.methods, settings, clock))
+    key, former = _key(made, scene, others), made.result.metrics.get("bands")
+    if isinstance(former, dict) and former.get("key") == key and _whole(output, former):
+        yield Note(text=f"{output} already contains these bands; nothing to do")
+        yield made.result
+        return
     bands, refused, notes = yield from clock.stage("rig", _placed(scene, others), keeps=False)
     yield from (Note(text=n, warning=True) for n in notes)
     lost: list[RejectedPhoto] = []
     while True:
-        drawing = _drawing(made, scene, bands, clock)
+        drawing = _drawing(made, scene, bands, clock, key)
         try:
             yield from clock.stage("bands", drawing.blocks(clock.workers), keeps=False)
             break
@@ -112,20 +122,40 @@ def _bands(made: FinishedMap, others: Sequence[Photo]) -> Generator[Event, None,
             bands = [b.without(error.photo) for b in bands]
             lost.append(RejectedPhoto(name=error.photo, reason=error.reason))
             yield Note(text=f"{error.photo} is left out: {error.reason}", warning=True)
-    figures = {"bands": band_figures(bands, refused, lost, drawing.tags["VALUES"], drawing.indices)}
+    values, indices = drawing.tags["VALUES"], [i.name for i in drawing.indices]
+    files = _stamps(output, (BANDS_FILE, *(f"{name}.tif" for name in indices)))
+    told = band_figures(bands, refused, lost, values, indices)
+    figures = {"bands": told | {"key": "" if lost else key, "files": files}}
     write_bands(output, made.result.metrics, figures)
     yield Result(output=output, metrics={**made.result.metrics, **figures})
 
 
-def _quietly(steps: Generator[Event, None, Scene]) -> Generator[Event, None, Scene]:
-    """A finished map's photos and ground, which are in the store: nothing is told of them."""
-    while True:
-        try:
-            next(steps)
-        except StopIteration as stop:
-            found: Scene = stop.value
-            return found
-        yield from ()
+def _key(made: FinishedMap, scene: Scene, others: Sequence[Photo]) -> str:
+    """What bands.tif depends on beside the code: the map, the files of other bands, and how the
+    camera of each is found.
+    """
+    aligned, ground, boundary = scene.aligned, scene.ground, made.settings.picture.boundary
+    return digest(
+        aligned.key,
+        ground.key,
+        ground.grid,
+        content_digest(boundary) if boundary is not None and boundary.is_file() else "",
+        made.methods.blend,
+        sorted((p.name, p.pixels_key) for p in (*aligned.photos, *others)),
+        (FindBandRig(), _placed, BandsDrawing),
+        __version__,
+    )
+
+
+def _whole(output: Path, former: Mapping[str, Any]) -> bool:
+    """Whether the rasters of an earlier run are as it wrote them."""
+    files = former.get("files")
+    return isinstance(files, dict) and bool(files) and files == _stamps(output, files)
+
+
+def _stamps(output: Path, names: Iterable[str]) -> dict[str, str]:
+    """What tells each of these files from another one."""
+    return {name: stamp(output / name) for name in names}
 
 
 def _placed(
@@ -208,7 +238,7 @@ def _together(aligned: AlignedPhotos, index: int, other: Photo) -> Together | No
 
 
 def _drawing(
-    made: FinishedMap, scene: Scene, bands: Sequence[PlacedBand], clock: Clock
+    made: FinishedMap, scene: Scene, bands: Sequence[PlacedBand], clock: Clock, key: str
 ) -> BandsDrawing:
     """How the rasters are drawn."""
     aligned, ground, settings = scene.aligned, scene.ground, made.settings
@@ -219,18 +249,6 @@ def _drawing(
     labels, _ = labels_of(aligned, ground, exposure, made.methods, clock, lambda _: None)
     kind = common_kind([c for b in bands if b.files.name != THERMAL for c in b.files.converts])
     indices = indices_of([b.files.name for b in bands])
-    tags = {"VALUES": kind}
-    key = digest(
-        aligned.key,
-        ground.key,
-        [
-            (b.files.name, sorted((i, b.files.photos[j].pixels_key) for i, j in b.of_photo.items()))
-            for b in bands
-        ],
-        [None if b.rig is None else (b.rig.b_R_a, b.rig.camera.vector) for b in bands],
-        [c.__repr__() for b in bands for c in b.files.converts],
-        FindBandRig(),
-    )
     return BandsDrawing(
         output=made.result.output,
         bands=bands,
@@ -241,6 +259,6 @@ def _drawing(
         blend=made.methods.blend,
         boundary=settings.picture.boundary,
         pixels_bytes=pixel_budget(settings.running.memory_gb),
-        key=key,
-        tags=tags,
+        key=digest(key, [(b.files.name, sorted(b.of_photo.items())) for b in bands]),
+        tags={"VALUES": kind},
     )

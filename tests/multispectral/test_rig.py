@@ -1,0 +1,79 @@
+"""The camera of a band is found beside that of the map's photos, whatever its lens."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from skyquilt.geometry.camera import project, rays
+from skyquilt.geometry.frames import rotation_from_vector
+from skyquilt.model.camera import Camera
+from skyquilt.model.registration import RefusedRegistration
+from skyquilt.multispectral.rig import BandRig, FindBandRig, Together
+from tests.multispectral.rigs import BandCamera, rig, seen
+from tests.texture import texture
+
+WIDE = Camera.ideal(width=900, height=700, focal=760.0)
+SIZE = (480, 360)
+FOCAL = 1.15 * 760.0 * 480 / 900
+
+
+def shows(picture, band):
+    """A photo of a picture that a wider camera took; brighter is darker for `nir`."""
+    grey = seen(picture, WIDE, band)
+    return (255 - grey if band.name == "nir" else grey).astype(np.uint8)
+
+
+def captures(a: BandCamera, b: BandCamera, number=3, camera_a=None):
+    made = (texture(700, 900, seed=k) for k in range(number))
+    return [Together(a=shows(p, a), camera_a=camera_a or a.camera, b=shows(p, b)) for p in made]
+
+
+def apart_px(found: BandRig, a: BandCamera, b: BandCamera, camera_a):
+    """How far pixels of the band are from where the true cameras have them, px of the map."""
+    x, y = np.meshgrid(*(np.linspace(0, n - 1, 25) for n in SIZE))
+    px = np.c_[x.ravel(), y.ravel()]
+    R = rotation_from_vector(b.turn) @ rotation_from_vector(a.turn).T
+    true = project(a.camera, rays(b.camera, px) @ R)
+    mine = project(camera_a, rays(found.camera, px) @ found.b_R_a)
+    inside = ((true > 0) & (true < np.array(SIZE) - 1)).all(1)
+    return np.linalg.norm(true - mine, axis=1)[inside]
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_bands_lie_on_each_other(seed):
+    """Also where the lens of the map's photos is not quite known: the band's takes that up."""
+    _, a, _, _, b = rig(seed, *SIZE, FOCAL)
+    adjusted = replace(a.camera, focal=0.99 * a.camera.focal, cx=a.camera.cx + 2, aspect=1.004)
+    told = Camera.ideal(width=SIZE[0], height=SIZE[1], focal=FOCAL)
+    pairs = captures(a, b, camera_a=adjusted)
+    found = FindBandRig()(pairs, told, 0.01)
+    assert isinstance(found, BandRig)
+    off = apart_px(found, a, b, adjusted)
+    assert np.median(off) < 0.1 and np.percentile(off, 95) < 0.3 and off.max() < 1.0
+    assert found.share > 0.9 and found.off_px < 0.25
+
+
+def test_other_ground_is_refused():
+    _, a, _, _, b = rig(3, *SIZE, FOCAL)
+    pairs = captures(a, b)
+    mixed = [replace(p, b=q.b) for p, q in zip(pairs, pairs[1:] + pairs[:1], strict=True)]
+    found = FindBandRig()(mixed, b.camera, 0.01)
+    assert isinstance(found, RefusedRegistration)
+    assert "of the patches of its photos agree" in found.reason
+
+
+def test_a_few_captures_of_other_ground_do_no_harm():
+    _, a, _, _, b = rig(4, *SIZE, FOCAL)
+    pairs = captures(a, b, 5)
+    mixed = [*pairs[:4], replace(pairs[4], b=pairs[0].b)]
+    found = FindBandRig()(mixed, b.camera, 0.01)
+    assert isinstance(found, BandRig)
+    assert np.median(apart_px(found, a, b, a.camera)) < 0.1
+
+
+def test_two_captures_are_too_few():
+    _, a, _, _, b = rig(5, *SIZE, FOCAL)
+    found = FindBandRig()(captures(a, b, 2), b.camera, 0.01)
+    assert isinstance(found, RefusedRegistration)
+    assert found.reason.startswith("2 of its photos were taken together")

@@ -1,0 +1,181 @@
+"""All bands of a simulated rig on the grid of its map."""
+
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+
+from skyquilt.errors import UsageError
+from skyquilt.model.event import Note, Result, StageStarted
+from skyquilt.multispectral import workflow
+from skyquilt.multispectral.workflow import iter_bands
+from skyquilt.runs.layers import layers_in
+from skyquilt.settings import MosaicSettings
+from tests.multispectral.rigs import film, reflectance
+
+SETTINGS = MosaicSettings(gsd_cm=15, jobs=2)
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_pairs():
+    """So that cameras are found sooner."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(workflow, "MOST_PAIRS", 3)
+        yield
+
+
+def shares(rgb, name):
+    """Red edge shows what red shows: their maps must be the same, up to noise."""
+    return reflectance(rgb, "red" if name == "red edge" else name)
+
+
+@pytest.fixture(scope="module")
+def photos(flight, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("rig") / "photos"
+    film(flight, folder, size=(500, 375), colours=True, shares=shares)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def bare(photos, tmp_path_factory):
+    """The files of bands without the photos in colours."""
+    folder = tmp_path_factory.mktemp("bare") / "photos"
+    shutil.copytree(photos, folder, ignore=shutil.ignore_patterns("*.JPG"))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def output(bare, tmp_path_factory):
+    """Bands beside a map of the green band."""
+    output = tmp_path_factory.mktemp("bands") / "out"
+    *_, last = iter_bands(bare, output, SETTINGS)
+    assert isinstance(last, Result)
+    return output
+
+
+def values_in(output):
+    with rasterio.open(output / "bands.tif") as source:
+        return dict(zip(source.descriptions, source.read(), strict=True))
+
+
+def beside_px(a, b):
+    """Median distance in px by which windows of one map lie beside those of another."""
+    off = []
+    for row in range(0, a.shape[0] - 48, 48):
+        for column in range(0, a.shape[1] - 48, 48):
+            window = (slice(row, row + 48), slice(column, column + 48))
+            p, q = a[window], b[window]
+            if not (np.isfinite(p).all() and np.isfinite(q).all()):
+                continue
+            dy, dx = np.gradient(cv2.GaussianBlur(p, (0, 0), 1.5))
+            change = cv2.GaussianBlur(q, (0, 0), 1.5) - cv2.GaussianBlur(p, (0, 0), 1.5)
+            system = np.c_[dx.ravel(), dy.ravel(), np.ones(dx.size)]
+            found = np.linalg.lstsq(system, change.ravel(), rcond=None)[0]
+            off.append(np.hypot(*found[:2]))
+    assert len(off) > 10
+    return float(np.median(off))
+
+
+def test_all_bands_lie_on_the_map(bare, output):
+    assert {"mosaic", "ndvi", "ndre", "gndvi"} <= set(layers_in(output))
+    with rasterio.open(output / "bands.tif") as b, rasterio.open(output / "mosaic.tif") as m:
+        assert b.descriptions == ("blue", "green", "red", "red edge", "nir")
+        assert (b.transform, b.shape, b.crs) == (m.transform, m.shape, m.crs)
+        assert b.tags()["VALUES"] == "relative"
+        shown = m.dataset_mask() > 0
+    values = values_in(output)
+    assert (np.isfinite(values["green"]) == shown).mean() > 0.999
+    for name, band in values.items():
+        assert np.isfinite(band[shown]).mean() > 0.93, name
+    assert beside_px(values["red"], values["red edge"]) < 0.15
+
+
+def test_bands_have_one_factor(output):
+    """Gains, exposure times and the light of the day differ: values do not."""
+    values = values_in(output)
+    both = np.isfinite(values["red"]) & np.isfinite(values["red edge"])
+    ratio = values["red"][both].sum() / values["red edge"][both].sum()
+    assert ratio == pytest.approx(1, abs=0.02)
+
+
+def test_indices_are_those_of_the_bands(output):
+    values = values_in(output)
+    with rasterio.open(output / "ndvi.tif") as source:
+        ndvi = source.read(1)
+    a, b = values["nir"], values["red"]
+    known = np.isfinite(ndvi)
+    np.testing.assert_allclose(ndvi[known], ((a - b) / (a + b))[known], atol=1e-6)
+    assert known[np.isfinite(a + b)].mean() > 0.99
+    assert np.abs(ndvi[known]).max() <= 1
+    low, high = np.percentile(ndvi[known], [10, 90])
+    assert high - low > 0.3  # fields and roads
+
+
+def test_figures_and_report(bare, output):
+    *_, last = iter_bands(bare, output, SETTINGS)
+    told = last.metrics["bands"]
+    assert [b["photos"] for b in told["shown"]] == [9] * 5 and told["refused"] == {}
+    assert told["indices"] == ["ndvi", "ndre", "gndvi"] and told["values"] == "relative"
+    own = [b["name"] for b in told["shown"] if b["off_px"] is None]
+    assert own == ["green"]
+    assert all(b["off_px"] < 0.4 for b in told["shown"] if b["off_px"] is not None)
+    assert last.metrics["photos_total"] == 9  # files of other bands are drawn, not left out
+    page = (output / "report.html").read_text(encoding="utf-8")
+    assert "Bands of bands.tif" in page and "Colour infrared" in page and page.count("NDVI") > 1
+
+
+def test_the_same_command_does_nothing_or_mends(bare, output):
+    events = list(iter_bands(bare, output, SETTINGS))
+    texts = [e.text for e in events if isinstance(e, Note)]
+    assert f"{output} already contains these bands; nothing to do" in texts
+    assert not any(isinstance(e, StageStarted) and e.stage == "bands" for e in events)
+    whole = (output / "ndvi.tif").read_bytes()
+    (output / "ndvi.tif").write_bytes(whole[: len(whole) // 2])
+    events = list(iter_bands(bare, output, SETTINGS))
+    assert any(isinstance(e, StageStarted) and e.stage == "bands" for e in events)
+    assert (output / "ndvi.tif").read_bytes() == whole
+
+
+def test_photos_in_colours_are_the_map_where_there_are_any(photos, tmp_path):
+    *_, last = iter_bands(photos, tmp_path / "out", SETTINGS)
+    with rasterio.open(tmp_path / "out" / "mosaic.tif") as source:
+        assert source.count == 3
+    told = last.metrics["bands"]["shown"]
+    assert [b["name"] for b in told] == ["blue", "green", "red", "red edge", "nir"]
+    assert all(b["off_px"] is not None and b["photos"] == 9 for b in told)
+    values = values_in(tmp_path / "out")
+    assert beside_px(values["red"], values["red edge"]) < 0.15
+
+
+def test_a_lost_file_and_a_band_of_other_ground_are_left_out(bare, tmp_path, monkeypatch):
+    shutil.copytree(bare, tmp_path / "photos")
+    gone, drawing = tmp_path / "photos" / "MS_0004_N.TIF", workflow._drawing
+
+    def drawn(*arguments):
+        gone.unlink(missing_ok=True)
+        return drawing(*arguments)
+
+    monkeypatch.setattr(workflow, "_drawing", drawn)
+    for seed, path in enumerate(sorted((tmp_path / "photos").glob("*_B.TIF"))):
+        raw = bytearray(path.read_bytes())
+        noise = np.random.default_rng(seed).integers(4000, 9000, 500 * 375, dtype=np.uint16)
+        raw[-2 * noise.size :] = noise.tobytes()
+        path.write_bytes(raw)
+    *before, last = iter_bands(tmp_path / "photos", tmp_path / "out", SETTINGS)
+    texts = [e.text for e in before if isinstance(e, Note)]
+    told = last.metrics["bands"]
+    assert list(told["refused"]) == ["blue"]
+    assert any("The band blue is left out" in text for text in texts)
+    assert [b["name"] for b in told["shown"]] == ["green", "red", "red edge", "nir"]
+    assert [b["photos"] for b in told["shown"]] == [9, 9, 9, 8]
+    assert told["photos_rejected"] == {"MS_0004_N.TIF": "its file is gone"}
+    assert "MS_0004_N.TIF is left out: its file is gone" in texts
+
+
+def test_photos_without_bands_are_refused(flight, tmp_path):
+    with pytest.raises(UsageError, match="--all-bands needs files that each show one band"):
+        list(iter_bands(flight / "photos", tmp_path / "out", SETTINGS))
+    assert not (tmp_path / "out" / "mosaic.tif").exists()
