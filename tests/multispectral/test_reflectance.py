@@ -259,6 +259,14 @@ def test_lasting_changes_stay_and_single_readings_do_not(bad, data):
     assert found[far] == pytest.approx(light[far])
 
 
+@pytest.mark.parametrize("count", [3, 4, 5, 12])
+@pytest.mark.parametrize("wild", [0.3, 2.5])
+def test_one_wild_reading_of_a_few(count, wild):
+    for at in range(count):
+        seen = [wild if k == at else 1.0 for k in range(count)]
+        assert list(smoothed_irradiance(range(count), seen)) == [1.0] * count
+
+
 def test_jitter_is_smoothed():
     rng = np.random.default_rng(1)
     light = np.where(np.arange(400) % 100 < 60, 1.0, 0.5)

@@ -260,22 +260,17 @@ def smoothed_irradiance(times_s: ArrayLike, values: ArrayLike) -> NDArray[np.flo
     timed = np.flatnonzero(np.isfinite(times))
     order = timed[np.argsort(times[timed], kind="stable")]
     logs = np.log(read)
-    near = _NEAR * _jitter(logs[order])
     half = WINDOW // 2
+    looked: list[tuple[int, NDArray[np.intp], float]] = []
     for k, at in enumerate(order):
         around = order[max(k - half, 0) : k + half + 1]
         around = around[(np.abs(times[around] - times[at]) <= REACH_S) & np.isfinite(read[around])]
         if around.size:
-            away = np.abs(logs[around] - np.median(logs[around]))
-            # of an even number of readings none may be as near as that, but two alike
-            found[at] = read[around[away <= max(near, away.min()) + _SAME]].mean()
+            looked.append((at, around, float(np.median(logs[around]))))
+    off = [abs(logs[at] - median) for at, _, median in looked if np.isfinite(read[at])]
+    near = _NEAR * _SIGMA_PER_MEDIAN * np.median(off) if off else 0.0
+    for at, around, median in looked:
+        away = np.abs(logs[around] - median)
+        # of an even number of readings none may be as near as that, but two alike
+        found[at] = read[around[away <= max(near, away.min()) + _SAME]].mean()
     return found
-
-
-def _jitter(logs: NDArray[np.float64]) -> float:
-    """Standard deviation of the jitter of readings, by the differences of successive ones, which
-    light that changes slowly, or seldom, hardly affects.
-    """
-    known = logs[np.isfinite(logs)]
-    steps = np.abs(np.diff(known))
-    return float(_SIGMA_PER_MEDIAN * np.median(steps) / math.sqrt(2)) if steps.size else 0.0
