@@ -13,7 +13,7 @@ from skyquilt.outside import whole
 
 if TYPE_CHECKING:
     from skyquilt import simulate as sim
-    from skyquilt.simulate.settings import FlightSettings
+    from skyquilt.simulate.settings import FlightSettings, Multispectral
     from skyquilt.simulate.weather import Weather
 
 PresetName = Literal["default", "demo", "strip", "roundtrip", "thermal", "drones"]
@@ -124,6 +124,13 @@ def command(
     thermal_hour: Annotated[
         float | None, typer.Option(help="solar time of the thermal flight")
     ] = None,
+    multispectral: Annotated[
+        bool | None,
+        typer.Option(
+            "--multispectral/--no-multispectral",
+            help="files of five bands of a camera beside that of the photos, as well",
+        ),
+    ] = None,
     video: Annotated[
         float | None, typer.Option(help="a clip of the flight, of so many frames per second")
     ] = None,
@@ -226,6 +233,8 @@ def command(
     base = _thermal(
         base, thermal, Weather(season=thermal_season or "summer", hour=thermal_hour or 13.0)
     )
+    if multispectral is not None:
+        base = replace(base, multispectral=_multispectral(base, size) if multispectral else None)
     base = replace(base, seed=base.seed if seed is None else seed, lens=_lens(base, size))
     base = _video(
         base,
@@ -311,6 +320,14 @@ def _thermal(
 
         flight = (flight or Thermal()) if wanted else None
     return replace(settings, thermal=None if flight is None else replace(flight, weather=weather))
+
+
+def _multispectral(settings: "FlightSettings", size: str | None) -> "Multispectral":
+    """A multispectral camera whose files have three fifths of the width of the photos."""
+    from skyquilt.simulate.settings import Multispectral
+
+    lens = _lens(settings, size)
+    return Multispectral(width=round(0.6 * lens.width), height=round(0.6 * lens.height))
 
 
 def _video(settings: "FlightSettings", **values: Any) -> "FlightSettings":

@@ -1,9 +1,11 @@
 """EXIF and XMP of simulated photos, and the files themselves."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from io import BytesIO
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,16 +49,25 @@ def write_jpeg(
     path.write_bytes(data)
 
 
-def write_tiff(path: Path, counts: NDArray[np.uint16], report: Report, body: Body) -> None:
-    """Writes a thermal frame (h, w) in hundredths of a kelvin, with its metadata."""
+def write_tiff(
+    path: Path,
+    counts: NDArray[np.uint16],
+    report: Report,
+    body: Body,
+    what: str = "unit: centikelvin (temperature in K times 100)",
+    more: Mapping[str, str] = MappingProxyType({}),
+) -> None:
+    """Writes counts (h, w), thermal ones in hundredths of a kelvin, with their metadata; `what`
+    they are, and `more` XMP.
+    """
     exif = _exif(report, body, counts.shape[1])
-    exif[0x010E] = "unit: centikelvin (temperature in K times 100)"
+    exif[0x010E] = what
     tags = ImageFileDirectory_v2()
     for tag, value in exif.items():
         tags[tag] = value
     for ifd in (_EXIF_IFD, _GPS_IFD):
         tags[ifd] = dict(exif.get_ifd(ifd))
-    xmp = _xmp(report)
+    xmp = _xmp(report, more)
     if xmp is not None:
         tags[_XMP_TAG] = xmp
         tags.tagtype[_XMP_TAG] = 1
@@ -109,7 +120,7 @@ def _degrees(value: float) -> tuple[IFDRational, IFDRational, IFDRational]:
     return IFDRational(whole, 1), IFDRational(minutes, 1), _rational(seconds, 1_000_000)
 
 
-def _xmp(report: Report) -> bytes | None:
+def _xmp(report: Report, more: Mapping[str, str] = MappingProxyType({})) -> bytes | None:
     """The XMP packet as DJI drones write it; None where it would be empty."""
     if report.gimbal is None or report.takeoff is None or report.flight_yaw is None:
         return None
@@ -137,6 +148,7 @@ def _xmp(report: Report) -> bytes | None:
         flat, up = report.rtk
         values |= {"RtkFlag": "50", "RtkStdLon": f"{flat:.5f}", "RtkStdLat": f"{flat:.5f}"}
         values["RtkStdHgt"] = f"{up:.5f}"
+    values |= more
     attributes = "".join(f'\n   drone-dji:{key}="{value}"' for key, value in values.items())
     return (
         '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>\n'

@@ -111,6 +111,22 @@ class Exposer:
         """The visible image (h, w, 3) as the camera stores it; `weather`: another moment than that
         of the scene; `smoke` that drifts over it.
         """
+        seen = self.colours(shot, rng, weather)
+        if smoke is not None:
+            veil = smoke.veil(self.directions, shot)[..., None]
+            seen = seen * (1 - veil) + veil * GREY
+        seen = _blurred(seen, settings)
+        seen *= (np.float32(gain) * falloff(self.lens, settings.vignetting))[..., None]
+        if settings.noise > 0:
+            seen += rng.standard_normal(seen.shape, dtype=np.float32) * np.float32(settings.noise)
+        return np.asarray(np.clip(seen + 0.5, 0, 255).astype(np.uint8))
+
+    def colours(
+        self, shot: Shot, rng: np.random.Generator, weather: Weather | None = None
+    ) -> Floats:
+        """Colours (h, w, 3), 0 to 255, of what lies in the way of each pixel's ray; `weather`:
+        another moment than that of the scene.
+        """
         hits, heights, window = self.pixels(shot)
         colours = (
             self.scene.rgb[window.slices]
@@ -123,14 +139,7 @@ class Exposer:
             place = hits * np.float32(window.res) + np.array([window.xs[0], -window.ys[0]])
             seen = with_waves(seen, place, heights <= self.scene.water + _WET_M, rng)
         seen = with_horizon(seen, self.scene, self.directions, shot)
-        if smoke is not None:
-            veil = smoke.veil(self.directions, shot)[..., None]
-            seen = seen * (1 - veil) + veil * GREY
-        seen = _blurred(seen, settings)
-        seen *= (np.float32(gain) * falloff(self.lens, settings.vignetting))[..., None]
-        if settings.noise > 0:
-            seen += rng.standard_normal(seen.shape, dtype=np.float32) * np.float32(settings.noise)
-        return np.asarray(np.clip(seen + 0.5, 0, 255).astype(np.uint8))
+        return np.asarray(seen, np.float32)
 
     def heat(
         self, shot: Shot, noise: float, offset: float, rng: np.random.Generator

@@ -14,16 +14,18 @@ from skyquilt.simulate.exif import Body, write_jpeg, write_tiff
 from skyquilt.simulate.expose import exposer, footprint
 from skyquilt.simulate.flight import Shot, Waypoint, fly, plan, site
 from skyquilt.simulate.ground import Ground
+from skyquilt.simulate.multispectral import SHORT, Sensor, rig_of, told
 from skyquilt.simulate.noise import Noise
 from skyquilt.simulate.reported import Place, Report, Start, place_at, report_all
 from skyquilt.simulate.scene import Country, Scene, empty_scene
-from skyquilt.simulate.settings import FlightSettings, Pictures, Thermal, Video
+from skyquilt.simulate.settings import FlightSettings, Multispectral, Pictures, Thermal, Video
 from skyquilt.simulate.smoke import smoke_of
 from skyquilt.simulate.terrain import WATER_M, depth
 from skyquilt.simulate.truth import (
     Taken,
     TakenClip,
     covered,
+    write_bands,
     write_rasters,
     write_thermal,
     write_truth,
@@ -37,7 +39,7 @@ on each axis; those of the Phantom 3 over Brighton change by 0.19 m in that time
 """
 EXPOSURE_S = 1e-3
 """Time for which the shutter of a planned flight is open."""
-_OURS = ("photos", "thermal", "video", "truth", "gcp_list.txt")
+_OURS = ("photos", "thermal", "multispectral", "video", "truth", "gcp_list.txt")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +47,7 @@ class Progress:
     """Progress of the simulation."""
 
     stage: str
-    """`terrain`, `photos`, `video`, `thermal terrain`, `thermal` or `truth`."""
+    """`terrain`, `photos`, `video`, `multispectral`, `thermal terrain`, `thermal` or `truth`."""
     done: int
     """Steps done in this stage."""
     total: int
@@ -247,6 +249,9 @@ def _write(world: World, output: Path) -> Iterator[Progress]:
     clips = []
     if world.video is not None and settings.video is not None:
         clips.append((yield from _roll(world, world.video, settings.video, scene, output)))
+    if settings.multispectral is not None:
+        taken += yield from _bands(world, settings.multispectral, scene, output)
+        write_bands(output / "truth", scene, part, world.place)
     del scene
     if world.thermal is not None and settings.thermal is not None:
         taken += yield from _film(world, world.thermal, settings.thermal, output)
@@ -373,6 +378,48 @@ def _roll(
         for s, r in zip(flight.shots, flight.reports, strict=True)
     ]
     return TakenClip(file="video/FLIGHT.MP4", fps=video.fps, frames=frames, blurred=windy.tolist())
+
+
+def _bands(
+    world: World, asked: Multispectral, scene: Scene, output: Path
+) -> Generator[Progress, None, list[Taken]]:
+    """Takes and writes a file for each band of each photo; returns what was taken."""
+    flight, settings = world.visible, world.settings
+    rig = rig_of(asked, flight.lens, settings.seed)
+    sensors = [Sensor.over(scene, band) for band in rig]
+    folder = output / "multispectral"
+    folder.mkdir(exist_ok=True)
+    taken = []
+    for number, (shot, report) in enumerate(zip(flight.shots, flight.reports, strict=True)):
+        rng = np.random.default_rng([settings.seed, 55, number])
+        light = 1 + asked.light_changes * float(np.sin(shot.waypoint.time / 40))
+        said = light * (1 + asked.sun_sensor_noise * float(rng.normal()))
+        capture = f"{settings.seed:08x}-{number:08x}"
+        plain = replace(report, turned=False, focal=None, dewarp=None)
+        for sensor in sensors:
+            band = sensor.band
+            counts, us = sensor.counts(shot, light, rng)
+            body = Body(
+                model="Simulated multispectral",
+                serial=f"MSP{shot.waypoint.drone + 1:03d}",
+                start=settings.weather.moment,
+            )
+            name = f"{shot.name}_MS_{SHORT[band.name]}.TIF"
+            more = told(band, asked, flight.lens, capture, us, said)
+            write_tiff(folder / name, counts, plain, body, f"band {band.name}", more)
+            taken.append(
+                Taken(
+                    shot=sensor.shot(shot),
+                    report=plain,
+                    band=band.name,
+                    file=f"multispectral/{name}",
+                    exposure=us / 1e6,
+                )
+            )
+        yield Progress(
+            stage="multispectral", done=number + 1, total=len(flight.shots), name=shot.name
+        )
+    return taken
 
 
 def _moment(world: World, shot: Shot) -> Weather | None:

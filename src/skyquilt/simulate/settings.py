@@ -199,6 +199,30 @@ class Thermal:
     """Standard deviation per pixel, K."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Multispectral:
+    """A camera of five bands on the same drone."""
+
+    width: int = 960
+    """Width of its files, px."""
+    height: int = 720
+    """Height of its files, px."""
+    narrower: float = 1.12
+    """Its view is narrower than that of the photos by this factor."""
+    turned_deg: float = 0.4
+    """Standard deviation of the angle, about each axis, by which its cameras are turned."""
+    apart_m: float = 0.03
+    """Distance between its cameras, m."""
+    light_changes: float = 0.15
+    """Largest relative change of the light during the flight."""
+    sun_sensor_noise: float = 0.02
+    """Relative standard deviation of what its sun sensor measures."""
+
+    def designed(self, flown: Lens) -> float:
+        """The focal length in px that files tell, beside a camera of the photos with this lens."""
+        return self.narrower * flown.focal * self.width / flown.width
+
+
 SrtLayout = Literal["mavic3", "gimbal", "air2s", "mavic2", "p4rtk", "mavic-pro", "matrice300"]
 
 
@@ -248,6 +272,8 @@ class FlightSettings:
     """Targets on the ground."""
     thermal: Thermal | None = None
     """The thermal flight, if there is one."""
+    multispectral: Multispectral | None = None
+    """The multispectral camera, if there is one."""
     video: Video | None = None
     """The clip, if there is one."""
     gsd: float | None = None

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from skyquilt.simulate.control import Observation, Surveyed
 from skyquilt.simulate.expose import footprint
 from skyquilt.simulate.flight import Shot
 from skyquilt.simulate.grid import Grid
+from skyquilt.simulate.multispectral import WAVELENGTHS, reflectance, rig_of
 from skyquilt.simulate.reported import Place, Report, Start
 from skyquilt.simulate.scene import Scene
 from skyquilt.simulate.settings import FlightSettings
@@ -33,11 +34,11 @@ class Taken:
     report: Report
     """The metadata."""
     band: str
-    """`visible` or `thermal`."""
+    """`visible`, `thermal` or the name of a multispectral camera's band."""
     file: str
     """Path below the output folder."""
     exposure: float
-    """Brightness factor (visible), or offset in K (thermal)."""
+    """Brightness factor (visible), offset in K (thermal), or exposure time in s (bands)."""
     blurred: bool = False
     """Whether a shake of the camera spoilt it."""
 
@@ -70,6 +71,9 @@ def write_truth(
     lenses = {"visible": settings.lens}
     if settings.thermal is not None:
         lenses["thermal"] = settings.thermal.lens
+    if settings.multispectral is not None:
+        rig = rig_of(settings.multispectral, settings.lens, settings.seed)
+        lenses |= {band.name: band.lens for band in rig}
     cameras = {name: _camera(lens) for name, lens in lenses.items()}
     cameras |= {f"{name}-turned": _camera(lens.turned()) for name, lens in lenses.items()}
     document = {
@@ -207,6 +211,19 @@ def write_rasters(folder: Path, scene: Scene, part: Grid, place: Place, base: fl
         VERTICAL_DATUM="sea level",
         UNIT="m",
     )
+
+
+def write_bands(folder: Path, scene: Scene, part: Grid, place: Place) -> None:
+    """Writes the true reflectance of each band, in thousandths."""
+    rgb = scene.rgb[part.slices]
+    whole = np.zeros((part.height, part.width, len(WAVELENGTHS)), np.uint16)
+    for row in range(0, part.height, 512):
+        seen = rgb[row : row + 512].astype(np.float32)
+        for k, name in enumerate(WAVELENGTHS):
+            whole[row : row + 512, :, k] = np.rint(1000 * reflectance(seen, name))
+    corner = replace(part, left=part.left + part.col * part.res, top=part.top - part.row * part.res)
+    at = replace(corner, row=0, col=0)
+    write_raster(folder / "truth_bands.tif", whole, at, place, BANDS=" ".join(WAVELENGTHS))
 
 
 def write_thermal(folder: Path, scene: Scene, part: Grid, place: Place) -> None:
