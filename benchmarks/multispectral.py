@@ -14,14 +14,17 @@ seconds of map and bands.
 import argparse
 import itertools
 import json
+import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import rasterio
-from cost import machine
 from numpy.typing import NDArray
 from rasterio.warp import Resampling, reproject
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from benchmarks.cost import machine
 
 from skyquilt.model.event import StageFinished
 from skyquilt.multispectral.workflow import iter_bands
