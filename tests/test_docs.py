@@ -14,8 +14,8 @@ TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
 BLOCK = re.compile(r"^```(bash|python)\n(.*?)^```", re.M | re.S)
 
 
-def test_there_are_five():
-    assert len(TUTORIALS) == 5
+def test_there_are_six():
+    assert len(TUTORIALS) == 6
 
 
 @pytest.mark.parametrize("page", TUTORIALS, ids=lambda p: p.stem)

@@ -124,7 +124,7 @@ class BandsDrawing:
             for done, (block, pixels) in enumerate(zip(todo, workers.each(one, todo), strict=True)):
                 for writer, some, values in zip((main, *others), left, pixels, strict=True):
                     if _corner(block) in some:
-                        writer.write_block(block, values, np.isfinite(values).any(2))
+                        writer.write_block(block, values, np.asarray(np.isfinite(values).any(2)))
                 yield done + 1, len(todo)
 
     def _writer(self, name: str, spec: RasterSpec) -> CogWriter:

@@ -127,7 +127,7 @@ def _composite(bands: Sequence[NDArray[np.float32]]) -> NDArray[np.uint8]:
         # the eye is used to pictures that are brighter in the dark
         share = np.clip((values - low) / max(float(high - low), 1e-9), 0, 1) ** (1 / 1.8)
         out.append(np.where(known, np.nan_to_num(share) * 255, 255))
-    return np.rint(np.stack(out, -1)).astype(np.uint8)
+    return np.asarray(np.rint(np.stack(out, -1)), np.uint8)
 
 
 def _index_picture(values: NDArray[np.float32], index: Index) -> tuple[NDArray[np.uint8], str, str]:

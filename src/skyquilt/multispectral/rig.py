@@ -184,7 +184,8 @@ class FindBandRig:
         ray_a = rays(found.camera_a, found.px_a)
 
         def lens(x: Array) -> Camera:
-            return replace(camera, **dict(zip(free, map(float, x[3:]), strict=True)))
+            changed: dict[str, Any] = dict(zip(free, map(float, x[3:]), strict=True))
+            return replace(camera, **changed)
 
         def misfit(x: Array) -> Array:
             there = project(lens(x), ray_a @ rotation_from_vector(x[:3]).T)
@@ -291,10 +292,10 @@ def _seen(
         cv2.remap(np.ascontiguousarray(there[..., k]), map_x, map_y, cv2.INTER_LINEAR)
         for k in (0, 1)
     )
-    source = pair.a
+    source: NDArray[Any] = pair.a
     finer = max(pair.a.shape) / max(h, w) / 1.1
     if finer > 1.5:  # as fine as the band, or fine structure would be aliased
-        source = cv2.GaussianBlur(source, (0, 0), 0.4 * finer)
+        source = cv2.GaussianBlur(pair.a, (0, 0), 0.4 * finer)
     seen = cv2.remap(source, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     height, width = pair.a.shape
     valid = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
