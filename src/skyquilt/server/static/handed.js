@@ -31,6 +31,7 @@ const showHere = async (file) => {
   } catch (error) { say(`${file.name} is not GeoJSON (${error.message})`); }
 };
 const handIn = async (files) => {
+  const photos = [];
   for (const file of files) {
     const plain = /\.(geo)?json$/i.test(file.name), layer = plain || /\.(kml|kmz|gpkg|zip)$/i.test(file.name);
     if (!state.info || !state.info.growing) {
@@ -38,19 +39,20 @@ const handIn = async (files) => {
       else if (!(await handControl(file))) say(`${file.name}: here, GeoJSON and lists of control points can be shown`);
       continue;
     }
-    const url = layer ? `layers?name=${encodeURIComponent(file.name)}` : `photos?name=${encodeURIComponent(file.name)}&source=browser`;
-    const answer = await fetch(url, { method: "POST", body: file, headers: writing({ "Content-Type": "application/octet-stream" }) }).catch(() => null);
+    if (!layer) { photos.push(file); continue; }
+    const answer = await fetch(`layers?name=${encodeURIComponent(file.name)}`, { method: "POST", body: file, headers: writing({ "Content-Type": "application/octet-stream" }) }).catch(() => null);
     if (!answer) { say(`${file.name}: the server does not answer`); continue; }
     const said = await answer.json().catch(() => ({}));
     if (!answer.ok) say(`${file.name}: ${said.detail || said.reason || answer.status}`);
   }
+  if (photos.length) send(photos);
 };
 $("files").onchange = () => { handIn([...$("files").files]); $("files").value = ""; };
 $("drop").onkeydown = (e) => { if (e.key === "Enter" || e.key === " ") { e.preventDefault(); $("files").click(); } };
 for (const name of ["dragover", "dragleave", "drop"]) document.addEventListener(name, (e) => {
   e.preventDefault();
   $("drop").classList.toggle("over", name === "dragover");
-  if (name === "drop" && e.dataTransfer) handIn([...e.dataTransfer.files]);
+  if (name === "drop" && e.dataTransfer) filesIn(e.dataTransfer).then(handIn);
 });
 $("finish").onclick = async () => {
   if (!window.confirm("Adjust all photos together and draw the final map at full resolution?")) return;

@@ -17,7 +17,7 @@ const readInfo = async () => {
   $("dropwords").textContent = finished ? "Drop or choose GeoJSON" : "Drop photos, GeoJSON, KML, GeoPackage or a zipped Shapefile, or choose";
   $("token").hidden = !(info.token && (info.growing || info.control));
   for (const name of ["profile", "volume"]) $(name).hidden = !info.heights;
-  $("counts").textContent = Object.entries(info.counts).filter(([, n]) => n).map(([k, n]) => `${n} ${k}`).join(", ");
+  showCounts();
   showMap();
   showSecond();
   follow();
@@ -25,6 +25,14 @@ const readInfo = async () => {
   readMeasures();
   if (done) await openFinal();
 };
+// How many photos are in which state, and, while the map grows, when the last one came.
+const showCounts = () => {
+  const counts = Object.entries(state.info.counts).filter(([, n]) => n).map(([k, n]) => `${n} ${k}`);
+  const came = Math.max(...[...state.photos.values()].map((p) => p.received || 0), 0);
+  if (state.info.growing && came) counts.push(`last came ${new Date(came * 1000).toLocaleTimeString()}`);
+  $("counts").textContent = counts.join(", ");
+};
+document.addEventListener("photoslisted", () => { if (state.info) showCounts(); });
 // After the flight: the final map is opened, with its files.
 const openFinal = async () => {
   if (!state.layers.has("finished")) return readFiles();  // of photos without positions
