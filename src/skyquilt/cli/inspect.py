@@ -160,8 +160,8 @@ def command(
     geo: Annotated[
         Path | None,
         typer.Option(
-            help="Side file of positions: geo.txt, CSV, .SRT, .MRK or .pos; of videos: .SRT, GPX, a"
-            " CSV with times, or a folder of these."
+            help="Side file of positions: geo.txt, CSV, .SRT, .MRK, .pos, or a track (GPX, a CSV"
+            " with times); of videos: .SRT, a track, or a folder of these."
         ),
     ] = None,
     cameras: Annotated[

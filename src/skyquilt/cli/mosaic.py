@@ -70,8 +70,8 @@ def command(
         Path | None,
         option(
             INPUT,
-            "Positions: geo.txt, CSV, .MRK, .SRT or .pos; of videos: .SRT, GPX, a CSV with times,"
-            " or a folder of these.",
+            "Positions: geo.txt, CSV, .MRK, .SRT, .pos, or a track (GPX, a CSV with times); of"
+            " videos: .SRT, a track, or a folder of these.",
             default="geo.txt among the photos; for videos the file beside each",
         ),
     ] = None,
@@ -82,8 +82,9 @@ def command(
         float | None,
         option(
             INPUT,
-            "Seconds to add to the time in a video to get the time of its positions.",
-            default="found from the flight's turns",
+            "Seconds to add to the time in a video, or of photos placed by a track, to get the"
+            " time of its positions.",
+            default="found: from the flight's turns, or the time zone",
         ),
     ] = None,
     cameras: Annotated[Path | None, option(INPUT, "Calibrations (cameras.json).")] = None,

@@ -154,7 +154,7 @@ def _leads_up(link: Path) -> bool:
     return Path(os.path.realpath(link.parent)).is_relative_to(os.path.realpath(link))
 
 
-_SIDE_ENDINGS = frozenset({".csv", ".tsv", ".mrk", ".pos"})
+_SIDE_ENDINGS = frozenset({".csv", ".tsv", ".mrk", ".pos", ".gpx"})
 """Endings of files that may hold positions of photos."""
 
 

@@ -33,10 +33,11 @@ from skyquilt.photos.srt import read_srt
 
 
 def apply_positions(
-    photos: Sequence[Photo], file: Path
+    photos: Sequence[Photo], file: Path, clock_offset_s: float | None = None
 ) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
-    """The photos with the positions from an `.mrk`, `.srt` or RTKLIB's `.pos` file, a table or a
-    `geo.txt`, and notes.
+    """The photos with the positions from an `.mrk`, `.srt` or RTKLIB's `.pos` file, a track (GPX or
+    a table with times; `clock_offset_s` as in `track_positions`), a table or a `geo.txt`, and
+    notes.
 
     Raises `SideFileError` where the file is malformed or contains none of the photos.
     """
@@ -52,6 +53,13 @@ def apply_positions(
         events, told = read_pos(file, photos)
         placed, said = apply_rows(photos, events, file=file, source="pos")
         return placed, (*said, *told)
+    if ending in (".gpx", ".csv"):
+        from skyquilt.photos.track_positions import is_track, read_track_rows
+
+        if is_track(file):
+            found, told = read_track_rows(file, photos, clock_offset_s)
+            placed, said = apply_rows(photos, found, file=file, source="gpx")
+            return placed, (*said, *told)
     _check_kind(file)
     if _is_table(file):
         rows, notes = read_positions(file)
@@ -92,10 +100,7 @@ def _check_kind(file: Path) -> None:
     begin = read_text(file)[:200].lstrip()
     known = next((said for head, said in _NO_TABLE.items() if begin.startswith(head)), None)
     if "<gpx" in begin:
-        raise SideFileError(
-            f"{file.name} is a GPX track, which is read for videos only. Write it into the photos"
-            f" first (ExifTool: exiftool -geotag {file.name} PHOTOS)."
-        )
+        raise SideFileError(f"{file.name} is a GPX track; give it the ending .gpx.")
     if known:
         raise SideFileError(
             f"{file.name} is {known}, which is not read for the positions of photos. Export them as"

@@ -152,6 +152,7 @@ def read_survey(
     thermal_unit: str | None = None,
     clips: bool = False,
     max_mp: float = MOST_MP,
+    clock_offset: float | None = None,
     read: ReadPhoto = read_photo,
 ) -> Survey:
     """All photos below a folder (or those given) in order of capture, without decoding their
@@ -159,7 +160,8 @@ def read_survey(
 
     `geo` is a side file of positions (`geo.txt`, a table, `.SRT`, `.MRK`, `.pos`); without one, a
     `geo.txt` at the top of the folder is used. `cameras` is a `cameras.json`, `thermal_unit` as in
-    `read_photo`, `max_mp` the largest area of a photo in megapixels, `read` what reads a file.
+    `read_photo`, `max_mp` the largest area of a photo in megapixels, `clock_offset` in s as in
+    `photos.track_positions`, `read` what reads a file.
     With `clips`, video clips are read too, and timed positions in `geo` (or a folder of such files)
     are those of the clips. A bad photo becomes a `RejectedPhoto`. Raises `UsageError` for a folder
     that does not exist, `NoPhotosError` where no photo can be read, `SideFileError` for a bad side
@@ -188,7 +190,7 @@ def read_survey(
     notes: tuple[str, ...] = ()
     side = geo or found.geo
     if side and photos and not (films and is_timed(side)):
-        photos, notes = apply_positions(photos, side)
+        photos, notes = apply_positions(photos, side, clock_offset)
     if cameras:
         photos, more = apply_cameras(photos, read_cameras_json(cameras), file=cameras)
         notes = (*notes, *more)

@@ -26,6 +26,7 @@ from skyquilt.photos.read import ReadPhoto, read_photo
 from skyquilt.photos.sequence import sequence_of
 from skyquilt.photos.shutter import stated_shutter
 from skyquilt.photos.survey import read_survey
+from skyquilt.photos.track_positions import is_track
 from skyquilt.settings import DEFAULTS, InputSettings, MosaicSettings
 
 Source = Path | Sequence[Path]
@@ -140,6 +141,7 @@ def read_input(
         cameras=settings.cameras,
         thermal_unit=settings.thermal_unit,
         max_mp=settings.max_mp,
+        clock_offset=settings.clock_offset,
         clips=True,
         read=read,
     )
@@ -237,7 +239,12 @@ def _idle(given: SurveyInput, settings: MosaicSettings) -> Iterator[str]:
     single = any(p.channels == 1 and p.path.suffix.lower() in TIFFS for p in photos)
     lossless = not clips and all(p.dtype != "uint8" for p in photos)
     for names, some, why in (
-        (("frame_overlap", "clock_offset", "write_frames"), clips, "there is no video"),
+        (("frame_overlap", "write_frames"), clips, "there is no video"),
+        (
+            ("clock_offset",),
+            clips or (settings.input.geo is not None and is_track(settings.input.geo)),
+            "there is no video, and no track of positions by time",
+        ),
         (("thermal_unit",), single, "no photo is a TIFF of one band"),
         (("balance_thermal",), any(p.unit for p in photos), "no photo has measured values"),
         (("quality",), not lossless, "these photos are stored without loss"),
