@@ -1,10 +1,14 @@
 """What the viewer of a finished run says of a place, against the run's own rasters."""
 
+import asyncio
 import io
 import os
 import shutil
 import subprocess
 import sys
+import tempfile
+import time
+from contextlib import suppress
 from pathlib import Path
 
 import httpx
@@ -12,10 +16,14 @@ import numpy as np
 import pytest
 import rasterio
 from pyproj import Transformer
+from starlette.requests import ClientDisconnect
 
+from skyquilt.errors import OutputError
 from skyquilt.raster.map_source import FileSource
 from skyquilt.runs.layers import RunLayer
+from skyquilt.server import parts
 from skyquilt.server.access import Guard
+from skyquilt.server.app import make_app
 from skyquilt.server.parts import write_part
 from skyquilt.server.server_thread import ServerThread
 from skyquilt.server.survey import open_survey
@@ -62,6 +70,43 @@ def test_a_saved_part_is_the_map_s_own_pixels(web, finished):
             assert part.bounds.left == pytest.approx(file.bounds.left + c * step, abs=1e-6)
     expected = whole[r : r + z.shape[0], c : c + z.shape[1]]
     assert z.size > 1000 and np.array_equal(z, expected, equal_nan=True)
+
+
+def test_a_saved_part_leaves_no_file(web, finished, tmp_path, monkeypatch):
+    """Neither once it is sent, nor where it cannot be written, nor where its client is gone."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    west, south, east, north = web.get("/info").json()["layers"][0]["bounds"]
+    query = f"bbox={west},{south},{east},{north}"
+    assert len(web.get(f"/export?{query}").content) > 10_000
+    until = time.monotonic() + 10
+    while list(tmp_path.iterdir()):  # the answer is here a moment before the server ends with it
+        assert time.monotonic() < until
+        time.sleep(0.01)
+
+    sent = []
+
+    async def gone(message):
+        sent.append(list(tmp_path.iterdir()))
+        raise OSError("the client is gone")
+
+    async def waiting():
+        await asyncio.sleep(60)
+
+    scope = {
+        "type": "http", "method": "GET", "path": "/export", "query_string": query.encode(),
+        "headers": [(b"host", b"127.0.0.1")], "asgi": {"spec_version": "2.4"},
+    }  # fmt: skip
+    app = make_app(open_survey(finished.output), Guard(), None, finished.output)
+    with suppress(OSError, ClientDisconnect):
+        asyncio.run(app(scope, waiting, gone))
+    assert len(sent[0]) == 1 and list(tmp_path.iterdir()) == []
+
+    def full(*_):
+        raise OutputError("the disk is full")
+
+    monkeypatch.setattr(parts, "write_part", full)
+    assert web.get(f"/export?{query}").status_code == 507
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_saved_part_of_an_older_map_in_degrees(finished, tmp_path):

@@ -8,7 +8,7 @@ from typing import Any
 from anyio import CapacityLimiter, to_thread
 from fastapi import HTTPException, Request, Response
 from fastapi.responses import FileResponse
-from starlette.background import BackgroundTask
+from starlette.types import Receive, Scope, Send
 
 from skyquilt.engine.free_memory import give_back
 from skyquilt.errors import SideFileError, UsageError
@@ -25,6 +25,16 @@ from skyquilt.version import __version__
 STATIC = Path(__file__).parent / "static"
 DRAWN_AT_ONCE = 2
 """Number of tiles drawn at a time. More would not be faster and would delay other requests."""
+
+
+class _Part(FileResponse):
+    """A file that is gone once it is sent, or once its client is gone."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            Path(self.path).unlink(missing_ok=True)
 
 
 class MapEndpoints:
@@ -143,9 +153,16 @@ class MapEndpoints:
         """A part of a layer as Cloud Optimized GeoTIFF; `bbox`: west,south,east,north in
         degrees.
         """
-        return await to_thread.run_sync(self._exported, bbox, layer, limiter=self._writing)
+        handle, path = tempfile.mkstemp(suffix=".tif")
+        os.close(handle)
+        try:
+            await to_thread.run_sync(self._exported, bbox, layer, Path(path), limiter=self._writing)
+        except BaseException:
+            Path(path).unlink(missing_ok=True)
+            raise
+        return _Part(path, media_type="image/tiff", filename="skyquilt-export.tif")
 
-    def _exported(self, bbox: str, layer: str | None) -> FileResponse:
+    def _exported(self, bbox: str, layer: str | None, path: Path) -> None:
         name, source = self.context.layer(layer)
         numbers = [real(v, -180, 180) for v in bbox.split(",", 4)]
         if len(numbers) != 4 or None in numbers:
@@ -156,17 +173,10 @@ class MapEndpoints:
         bounds = between("EPSG:4326", source.crs).transform_bounds(west, south, east, north)
         from skyquilt.server.parts import write_part  # asked for by few
 
-        handle, path = tempfile.mkstemp(suffix=".tif")
-        os.close(handle)
-        gone = BackgroundTask(Path(path).unlink, missing_ok=True)
         try:
-            some = write_part(source, self.images.style(name), bounds, Path(path))
+            some = write_part(source, self.images.style(name), bounds, path)
         except UsageError:
             some = False
         give_back()
         if not some:
-            Path(path).unlink(missing_ok=True)
             raise HTTPException(404, "the map is empty there")
-        return FileResponse(
-            path, media_type="image/tiff", filename="skyquilt-export.tif", background=gone
-        )
