@@ -4,30 +4,31 @@ python -m fuzz.run --seconds 10              every target for so long
 python -m fuzz.run --minutes 5               all targets together for so long
 python -m fuzz.run --seeds                   every seed once, without fuzzing
 python -m fuzz.run jpeg --seconds 60
-python -m fuzz.run --minutes 2 --seed 1      the same inputs every time, as far as the time goes
+python -m fuzz.run --minutes 1 --seed 1      the same inputs every time, as far as the time goes
 
 An input on which a target fails is kept in fuzz/found; once the reader is mended, it belongs into
 fuzz/seeds as a regression test.
 """
 
 import argparse
+import io
 import os
 import random
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
 import traceback
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
+from contextlib import redirect_stderr
 from pathlib import Path
 
 HERE = Path(__file__).parent
 SLOW_S, MEMORY_MB = 10, 2500
 JOBS = 2
 """Targets that are fuzzed at a time."""
-START_S = 4.0
-"""Time in s that a target takes to start."""
+START_S = 0.5
+"""Time in s that a target takes to start and to end."""
 
 
 def seeds() -> int:
@@ -56,9 +57,8 @@ def fuzz_one(name: str, seconds: float, corpus: Path, seed: int | None) -> None:
     """Fuzzes one target in this process; atheris ends it. With a seed the inputs are repeatable."""
     import atheris
 
-    with atheris.instrument_imports(include=["skyquilt"]):
-        from fuzz.targets import TARGETS, prepare
     from fuzz.mutations import mutated
+    from fuzz.targets import TARGETS, prepare
 
     target = TARGETS[name]
     prepare(name)
@@ -89,6 +89,52 @@ def fuzz_one(name: str, seconds: float, corpus: Path, seed: int | None) -> None:
     atheris.Fuzz()
 
 
+def instrumented() -> list[str]:
+    """Imports what is fuzzed, for this process and its copies; names of the targets."""
+    import atheris
+
+    told = redirect_stderr(io.StringIO())  # a line for each module
+    with told, atheris.instrument_imports(include=["skyquilt"]):
+        from fuzz.targets import TARGETS
+    return list(TARGETS)
+
+
+def forked(name: str, seconds: float, corpora: Path, seed: int | None) -> int:
+    """Fuzzes one target in a copy of this process, whose number is returned; what it says goes to
+    `NAME.log` in the folder. The copy has the instrumented readers already: to import them takes
+    longer than CI fuzzes one of them.
+    """
+    child = os.fork()
+    if child:
+        return child
+    # the fuzzer ends without Python's clean-up: what targets write goes with the corpora
+    tempfile.tempdir = os.environ["TMPDIR"] = str(corpora)
+    log = os.open(corpora / f"{name}.log", os.O_WRONLY | os.O_CREAT)
+    for stream in (1, 2):
+        os.dup2(log, stream)
+    fuzz_one(name, seconds, corpora / name, seed)
+    sys.exit()  # and not os._exit: an input that ends the process is kept as it exits
+
+
+def fuzz(names: list[str], seconds: float, corpora: Path, seed: int | None) -> Iterator[str]:
+    """Fuzzes targets, some at a time; yields those that failed."""
+    waiting, running = names[::-1], dict[int, tuple[str, float]]()
+    while waiting or running:
+        while waiting and len(running) < JOBS:
+            name = waiting.pop()
+            running[forked(name, seconds, corpora, seed)] = name, time.monotonic()
+        child, status = os.wait()
+        name, began = running.pop(child)
+        took = f"{time.monotonic() - began:.0f} s"
+        said = (corpora / f"{name}.log").read_text(errors="replace")
+        if status == 0:
+            runs = [line for line in said.splitlines() if line.startswith("Done ")]
+            print(f"{name}: {(runs or [''])[-1]} ({took} in all)", flush=True)
+        else:
+            print(f"{name}: failed ({took})\n{said[-5500:]}", flush=True)
+            yield name
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("target", nargs="?")
@@ -96,59 +142,22 @@ def main() -> int:
     parser.add_argument("--minutes", type=float)
     parser.add_argument("--seed", type=int)
     parser.add_argument("--seeds", action="store_true")
-    parser.add_argument("--corpus", type=Path)
     asked = parser.parse_args()
     if asked.seeds:
         return min(seeds(), 1)
-    if asked.corpus:
-        fuzz_one(asked.target, asked.seconds, asked.corpus, asked.seed)
-        return 0
-    names = [asked.target] if asked.target else _names()
+    if asked.seed is not None and os.environ.get("PYTHONHASHSEED") != "0":
+        again = [sys.executable, "-m", "fuzz.run", *sys.argv[1:]]
+        os.execve(sys.executable, again, {**os.environ, "PYTHONHASHSEED": "0"})
+    names = instrumented()
+    names = [asked.target] if asked.target else names
     seconds = asked.seconds or 60 * (asked.minutes or 5) * JOBS / len(names) - START_S
-    seconds = max(1.0, seconds)
     corpora = Path(tempfile.mkdtemp(prefix="skyquilt-corpus-"))
-
-    def one(name: str) -> bool:
-        command = [sys.executable, "-m", "fuzz.run", name, "--seconds", str(seconds)]
-        if asked.seed is not None:
-            command += ["--seed", str(asked.seed)]
-        # the fuzzer ends without Python's clean-up: what targets write goes with the corpora
-        env = {**os.environ, "TMPDIR": str(corpora)}
-        if asked.seed is not None:
-            env["PYTHONHASHSEED"] = "0"
-        began = time.monotonic()
-        done = subprocess.run(
-            [*command, "--corpus", str(corpora / name)],
-            env=env,
-            capture_output=True,
-            text=True,
-            errors="replace",
-            check=False,
-        )
-        took = f"{time.monotonic() - began:.0f} s"
-        if done.returncode == 0:
-            runs = [line for line in done.stderr.splitlines() if line.startswith("Done ")]
-            print(f"{name}: {(runs or [''])[-1]} ({took} in all)", flush=True)
-        else:
-            print(
-                f"{name}: failed ({took})\n{done.stdout[-1500:]}{done.stderr[-4000:]}", flush=True
-            )
-        return done.returncode == 0
-
-    with ThreadPoolExecutor(JOBS) as pool:
-        held = list(pool.map(one, names))
-    failed = [name for name, good in zip(names, held, strict=True) if not good]
+    failed = list(fuzz(names, max(1.0, seconds), corpora, asked.seed))
     shutil.rmtree(corpora, ignore_errors=True)
     print(
         f"{len(names)} targets, {len(failed)} failed: {', '.join(failed)}" if failed else "all held"
     )
     return min(len(failed), 1)
-
-
-def _names():
-    from fuzz.targets import TARGETS
-
-    return list(TARGETS)
 
 
 if __name__ == "__main__":
