@@ -26,6 +26,7 @@ from skyquilt.live.settings import LiveSettings
 from skyquilt.live.workflow import iter_live
 from skyquilt.model.event import Note
 from tests.attacks import SHARED, jpeg, needs_attacks
+from tests.live.clock import Clock
 
 QUICK = LiveSettings(features=600)
 
@@ -172,7 +173,7 @@ class Box:
         settings = LiveSettings(**settings)
         inbox = Inbox(self.ledger, self.out / "photos", most_bytes=settings.most_bytes)
         self.intake = Intake(self.ledger, inbox, settings)
-        self.watch = Watch(folder=self.folder, intake=self.intake)
+        self.watch, self.clock = Watch(folder=self.folder, intake=self.intake), Clock()
 
     def look(self, seconds=1.0, photos=None):
         """What is taken or refused within some seconds; soon after so many `photos` no more is
@@ -180,8 +181,7 @@ class Box:
         """
         found, rounds = [], int(seconds / 0.05)
         while rounds > 0:
-            found += self.watch.look()
-            threading.Event().wait(0.05)
+            found += self.clock.look(self.watch, 0.05)
             rounds = (
                 min(rounds - 1, 5) if photos is not None and len(found) >= photos else rounds - 1
             )

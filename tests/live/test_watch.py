@@ -3,7 +3,6 @@
 import errno
 import os
 import shutil
-import time
 from pathlib import Path
 
 import pytest
@@ -15,6 +14,7 @@ from skyquilt.live.inbox import Inbox
 from skyquilt.live.ledger import Ledger
 from skyquilt.live.photo_intake import Accepted, Intake, Refused
 from skyquilt.live.settings import LiveSettings
+from tests.live.clock import Clock
 
 
 class Watched:
@@ -26,14 +26,13 @@ class Watched:
         self.out.mkdir(parents=True)
         self.ledger = Ledger(self.out, write=True)
         self.intake = Intake(self.ledger, Inbox(self.ledger, self.out / "photos"), LiveSettings())
-        self.watch = Watch(folder=self.folder, intake=self.intake)
+        self.watch, self.clock = Watch(folder=self.folder, intake=self.intake), Clock()
 
     def look(self, seconds):
         """All that is taken or refused within some seconds."""
-        done, until = [], time.monotonic() + seconds
-        while time.monotonic() < until:
-            done += self.watch.look()
-            time.sleep(0.005)
+        done = []
+        for _ in range(round(seconds / 0.01)):
+            done += self.clock.look(self.watch, 0.01)
         return done
 
 
