@@ -1,5 +1,5 @@
 """Flights that are simulated once for all processes that run tests beside one another, and pictures
-that are looked at once by each.
+that are looked at and commands that are made once by each.
 """
 
 import copy
@@ -9,11 +9,13 @@ import os
 from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from unittest import mock
 
 import numpy as np
 import pytest
+import typer.main
 
 from skyquilt.matching.sift import Sift
 from skyquilt.model.features import Features
@@ -35,6 +37,8 @@ def flown_once(temporary: pytest.TempPathFactory, name: str, settings: FlightSet
             whole.touch()
     return folder
 
+
+typer.main.get_command = cache(typer.main.get_command)
 
 PICTURES = 200
 """Pictures whose features are remembered, those seen last: some hundred MB."""

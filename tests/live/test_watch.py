@@ -75,6 +75,14 @@ def test_a_file_that_stays_torn_is_refused_and_taken_when_it_is_whole(watched, f
     assert [type(d) for d in watched.look(0.4)] == [Accepted]
 
 
+def test_a_file_must_be_quiet_where_the_system_does_not_tell(tmp_path, flight, monkeypatch):
+    monkeypatch.setattr(watching.ClosedFiles, "_watch", lambda *_: False)
+    found = Watched(tmp_path)
+    shutil.copyfile(flight.photos[0], found.folder / "a.jpg")
+    assert found.look(0.04) == []
+    assert [type(d) for d in found.look(0.02)] == [Accepted]
+
+
 def test_a_complete_file_is_taken_without_waiting(tmp_path, flight, monkeypatch):
     monkeypatch.setattr(watching, "QUIET_S", 60.0)
     found = Watched(tmp_path)

@@ -222,7 +222,11 @@ def _least_median(x: Complex, y: Complex) -> tuple[complex, complex]:
     g = (y[k] - y[m]) / (x[k] - x[m])
     c = y[k] - g * x[k]
     rank = min(len(x), max(3, len(x) // 2 + 1)) - 1
-    middle = [np.partition(np.abs(y - u * x - v), rank)[rank] for u, v in zip(g, c, strict=True)]
+    middle = np.empty(len(g))
+    some = max(1, 65536 // len(x))  # at a time, so that memory stays small
+    for lo in range(0, len(g), some):
+        off = np.abs(y - g[lo : lo + some, None] * x - c[lo : lo + some, None])
+        middle[lo : lo + some] = np.partition(off, rank)[:, rank]
     best = int(np.argmin(middle))
     return complex(g[best]), complex(c[best])
 
