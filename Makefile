@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --quiet 
 # each of the test processes ten seconds.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: install demo test test-all check format docs fuzz fuzz-quick wheels sbom locked clean
+.PHONY: install demo test quick test-all check format docs fuzz fuzz-quick wheels sbom locked clean
 
 # The program with its live map and viewer: .venv/bin/skyquilt
 install: $(USE)
@@ -21,9 +21,12 @@ demo: $(USE)
 	@$(BIN)/skyquilt mosaic demo/flight/photos --gcp demo/flight/gcp_list.txt -o demo/map --overwrite
 	@$(BIN)/python examples/04_map_against_truth.py demo/map/mosaic.tif demo/flight/truth/truth_ortho.tif demo/map/metrics.json
 
-# Lint, format, types and import contract, then the tests that take no more than a few seconds each.
-test: check
-	@$(BIN)/pytest -m "not slow" --numprocesses auto --dist loadscope
+# Lint, format, types and import contract, and the tests that take no more than a few seconds each, at the same time.
+test: $(DEVELOP)
+	@$(MAKE) --no-print-directory --jobs 2 check quick
+
+quick: $(DEVELOP)
+	@MAKEFLAGS= $(BIN)/pytest -m "not slow" --numprocesses auto --dist loadscope
 
 # Every test, the slow ones included.
 test-all: $(DEVELOP)
