@@ -19,6 +19,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -34,6 +35,15 @@ MOST_LINES = 300
 Stops = dict[str, set[str]]
 
 
+@cache
+def ours(name: str) -> str:
+    """A source file's path within the package; empty: it is not to be counted."""
+    if not name.startswith(str(ROOT)):
+        return ""
+    file = Path(name).relative_to(ROOT).as_posix()
+    return file if file.endswith(".py") and not file.startswith(LEFT_OUT) else ""
+
+
 @contextmanager
 def watched(passes: Callable[[FrameType], bool], stops: Stops) -> Iterator[None]:
     """Notes functions of ours, in any thread, whose call `passes`."""
@@ -42,11 +52,10 @@ def watched(passes: Callable[[FrameType], bool], stops: Stops) -> Iterator[None]
         if event != "call":
             return
         code = frame.f_code
-        name = code.co_filename
-        if not name.startswith(str(ROOT)) or code.co_name == "<module>":
+        file = ours(code.co_filename)
+        if not file or code.co_name in stops.get(file, ()) or code.co_name == "<module>":
             return
-        file = Path(name).relative_to(ROOT).as_posix()
-        if file.endswith(".py") and not file.startswith(LEFT_OUT) and passes(frame):
+        if passes(frame):
             stops.setdefault(file, set()).add(code.co_name)
 
     threading.setprofile(look)
