@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from hypothesis import settings as hypothesis_settings
 
+from skyquilt.engine.free_memory import return_large_blocks
 from skyquilt.model.event import Event, Result
 from skyquilt.settings import MosaicSettings
 from skyquilt.simulate import FlightSettings
@@ -20,6 +21,8 @@ from skyquilt.workflows.mosaic import iter_mosaic
 from tests.once import flown_once
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
+
+return_large_blocks()  # as the program does: pages that are asked for again and again cost a tenth
 
 # on a busy machine a time limit per example judges the machine
 hypothesis_settings.register_profile("skyquilt", deadline=None)

@@ -262,7 +262,8 @@ def test_rays_that_do_not_meet_tell_no_ground_but_from_one_place():
     assert within_noise(crowd)
 
 
-@pytest.mark.parametrize("turn", [90, pytest.param(180, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("turn", [90, 180])
 def test_headings_that_are_all_false_by_one_angle_are_corrected(turn):
     flown = Slanting(orbit(20, 50), seed=turn)
     flown.priors = [replace(p, yaw_deg=p.yaw_deg + turn) for p in flown.priors]

@@ -150,6 +150,7 @@ def test_pairs_show_their_heights_where_positions_err_by_two_metres(flight, tmp_
     assert r.min() >= 0.9 and 0.9 <= slope.min() <= slope.max() <= 1.1, told
 
 
+@pytest.mark.slow
 def test_two_photos_show_their_heights_and_their_field(flight, tmp_path):
     photos = sorted((flight / "photos").glob("*.jpg"))[:2]
     result = depth(photos, tmp_path / "out", SETTINGS)

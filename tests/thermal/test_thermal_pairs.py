@@ -69,6 +69,7 @@ def test_one_pair_suffices_by_homographies(scene, other, monkeypatch):
     assert offs[0].max() < 2.0 and np.median(offs[1]) < 6.0
 
 
+@pytest.mark.slow
 def test_blocks_that_share_no_ground_are_refused(scene, other):
     far = other.aligned.alignment.frame.origin[0] + 5000
     found = by_pairs(scene, in_frame(other, (far, 0.0)))
