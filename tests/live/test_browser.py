@@ -4,7 +4,6 @@ import io
 import json
 import os
 import shutil
-import time
 from pathlib import Path
 
 import numpy as np
@@ -244,15 +243,7 @@ def test_two_spectra_lie_beside_each_other_on_either_side_of_the_handle(page, bo
         for path in [*both.photos, *sorted((both.folder / "thermal").glob("*.tif"))]:
             assert site.send(path).is_success
         site.until(lambda: all(p["ring"] for p in site.web.get("/photos").json()["photos"]))
-        site.until(
-            lambda: (
-                not (site.live.queues.untried or site.live.redraw.dirty or site.live.redraw.later)
-            )
-        )
-        before = None
-        while (now := site.web.get("/photos").json()["photos"]) != before:
-            before = now  # later adjustments move photos: the pictures compared show one state
-            time.sleep(5)
+        site.settle()
         page.goto(site.url)
         page.wait_for_selector("#link.live")
         holds(page, "[...document.querySelector('#layer').options].some(o => o.value == 'thermal')")

@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import threading
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -292,9 +293,9 @@ def test_an_inbox_that_the_system_does_not_answer_for_is_waited_for(tmp_path, mo
     assert len(box.look(2.5, photos=1)) == 1
 
 
-def run_until(live, inbox, done, seconds=60):
-    """Notes of a live map that runs until `done()`."""
-    stop = threading.Event()
+def run_until(live, inbox, done, seconds=60, stop=None):
+    """Notes of a live map that runs until `done()` after something happened, or until `stop`."""
+    stop = stop or threading.Event()
     timer = threading.Timer(seconds, stop.set)
     timer.start()
     notes = []
@@ -312,18 +313,20 @@ def test_an_inbox_that_goes_away_is_told_once_and_when_it_is_back(tmp_path, monk
     inbox = tmp_path / "in"
     inbox.mkdir()
     live = LiveMap(tmp_path / "out", QUICK)
-    rounds = iter(range(1000))
+    rounds, stop = count(), threading.Event()
 
     def moved(folder, *rest):
         if (n := next(rounds)) == 20:
             inbox.rename(tmp_path / "away")
         elif n == 60:
             (tmp_path / "away").rename(inbox)
+        elif n == 200:
+            stop.set()
         return real(folder, *rest)
 
     real = workflow._away
     monkeypatch.setattr(workflow, "_away", moved)
-    notes = run_until(live, inbox, lambda _: next(rounds, 1000) > 200, 10)
+    notes = run_until(live, inbox, lambda _: False, stop=stop)
     live.close()
     assert notes == [
         f"{inbox} cannot be found or read; no photo arrives from there until it is back",
@@ -336,15 +339,18 @@ def test_a_disk_that_stays_full_is_told_once(tmp_path, monkeypatch):
     inbox = tmp_path / "in"
     inbox.mkdir()
     live = LiveMap(tmp_path / "out", QUICK)
-    failing = iter([OutputError("the disk is full")] * 5 + [None] * 3 + [OutputError("again")] * 2)
+    errors = [OutputError("the disk is full")] * 5 + [None] * 3 + [OutputError("again")] * 2
+    failing, stop = iter([*errors, *[None] * 20]), threading.Event()
 
     def work():
-        if (error := next(failing, None)) is not None:
+        if (error := next(failing, stop)) is stop:
+            stop.set()
+        elif error is not None:
             raise error
 
     monkeypatch.setattr(workflow, "FULL_S", 0.0)
     monkeypatch.setattr(live, "work", work)
-    notes = run_until(live, inbox, lambda _: next(failing, 0) == 0, 10)
+    notes = run_until(live, inbox, lambda _: False, stop=stop)
     live.close()
     assert notes == ["the disk is full", "again"]
 
