@@ -67,9 +67,13 @@ def finished(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished
     return Finished(output=output, events=events)
 
 
+LONG = ("test_large_survey", "test_windows", "test_docs")
+"""Files of tests that take a minute and more."""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The longest test begins first, so that it does not run alone after all others."""
-    items.sort(key=lambda item: "test_large_survey" not in item.nodeid)
+    """The longest files begin first, so that none runs alone after all others."""
+    items.sort(key=lambda item: item.path.stem not in LONG)
 
 
 def pytest_collection_finish() -> None:
