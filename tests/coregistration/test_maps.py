@@ -257,7 +257,7 @@ def test_degrees_of_equal_size_are_not_as_wide_as_high(tmp_path, shift):
 def test_maps_of_a_local_system_or_of_none(scene, tmp_path):
     """A local system beside one of the Earth ended in a traceback; one beside none is its own."""
     path, b = scene
-    for crs, told in ((CRS.from_wkt(LOCAL).to_wkt(), False), (None, True), ("EPSG:32633", True)):
+    for crs, told in ((CRS.from_wkt(LOCAL).to_wkt(), False), (None, True)):
         write(tmp_path / "b.tif", b, place_b(), crs, nodata=0)
         record = register(path, tmp_path / "b.tif", tmp_path / "out", overwrite=True).metrics
         assert (record["guess"] is not None) == told

@@ -1,5 +1,6 @@
 """Kinds of terrain: their shapes by formula, what stands on them, and waves that move."""
 
+from functools import cache
 from typing import get_args
 
 import cv2
@@ -23,6 +24,7 @@ from tests.simulate.test_geometry import LENS
 BOUNDS = (-110.0, -110.0, 110.0, 110.0)
 
 
+@cache
 def country(kind: Terrain) -> Country:
     return Country(settings=SceneSettings(kind=kind), bounds=BOUNDS, seed=5)
 
