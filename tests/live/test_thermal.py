@@ -96,6 +96,19 @@ def test_no_layer_joins_degrees_counts_and_colours(band, unit, layer, tmp_path):
         assert survey.styles()[name].measured == bool(unit)
 
 
+def test_measured_frames_have_no_palettes_to_tell_of(tmp_path):
+    """A flight of radiometric photos alone: each had been refused, from the second on."""
+    ledger = Ledger(tmp_path, write=True)
+    members = SimpleNamespace(by_id={}, ledger=ledger)
+    notes = ThermalNotes(SimpleNamespace(members=members, thumbnail={}.__getitem__))
+    for k in range(3):
+        one = replace(photo(), name=f"{k}.jpg", unit="celsius")
+        members.by_id[k] = SimpleNamespace(id=k, photo=one, tried=k + 1, state="refined")
+        notes.look(members.by_id[k])
+    assert not ledger.rows("select body from event")
+    ledger.close()
+
+
 def test_palettes_and_units_are_told_once_each(tmp_path):
     """With the sentences of whole flights, as photos come one by one, and not again after a
     restart.

@@ -121,8 +121,10 @@ UNKNOWN_SHUTTER = Shutter(readout_s=0.0, sigma_s=0.0, source="unknown")
 
 
 def evenly(number: int, most: int) -> list[int]:
-    """Indices of at most `most` of a number of photos, spread evenly from the first to the last."""
-    spread = np.linspace(0, number - 1, most).round().astype(int)
+    """Indices of at most `most` of a number of photos, spread evenly from the first to the last;
+    none of no photos.
+    """
+    spread = np.linspace(0, number - 1, most if number else 0).round().astype(int)
     return [int(k) for k in np.unique(spread)]
 
 
