@@ -43,7 +43,7 @@ class ApplyAdjustment:
         self.schedule.ended()
         with self.ledger.change():
             self.members.save_cameras(done.cameras)
-            self.refinement.heights(done.xyz, done.poses, known=bool(done.cameras), anew=True)
+            self.refinement.heights(done.xyz, done.poses, known=bool(done.cameras), together=True)
             self.refinement.move(done.poses, done.camera_of)
             for member in since:
                 self._follow(member, steps)

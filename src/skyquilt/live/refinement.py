@@ -82,7 +82,8 @@ class Refinement:
             self.ledger.put_links(links)
             self.members.save_cameras(change.cameras)
             member.tried = self._tried
-            self.heights(change.xyz, change.moved, known=bool(change.cameras))
+            whole = bool(change.cameras)
+            self.heights(change.xyz, change.moved, known=whole, together=whole)
             self.move(change.moved, change.camera_of)
             if member.state == "refined":
                 self._learn(member, loop=far)
@@ -154,23 +155,56 @@ class Refinement:
         poses: Mapping[int, Pose],
         *,
         known: bool,
-        anew: bool = False,
+        together: bool = False,
     ) -> None:
         """Adds ground points (P, 3) in m of photos with these poses to the height cells (inside a
-        transaction); `known`: they come from calibrated cameras.
+        transaction, before the photos are moved); `known`: they come from calibrated cameras;
+        `together`: from an adjustment that tells all ground of these photos anew.
         """
         xyz = on_ground(xyz, poses, self.redraw.canvas.ground)
         cells = self.local_pose.metadata.heights
-        touched, z = cells.add(xyz, anew=anew)
+        together = together and len(xyz) > 0
+        touched, z = cells.renew(xyz, *self._ground_of(poses)) if together else cells.add(xyz)
         with self.ledger.change() as db:
             values = [
                 (c, r, height) for (c, r), height in zip(touched.tolist(), z.tolist(), strict=True)
             ]
-            db.executemany("insert or replace into height values (?, ?, ?)", values)
+            gone = [v[:2] for v in values if np.isnan(v[2])]
+            db.executemany("delete from height where col = ? and row = ?", gone)
+            db.executemany(
+                "insert or replace into height values (?, ?, ?)",
+                [v for v in values if not np.isnan(v[2])],
+            )
             if known and len(xyz):
                 ground = float(np.median(xyz[:, 2]))
                 self.ledger.put_meta("ground", ground)
                 self.redraw.canvas.ground = ground
+
+    def _ground_of(self, poses: Mapping[int, Pose]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Cells (k, 2) with heights below photos that are about to get these poses, nearest to them
+        of all photos on the map; and whether their photo moves sideways by more than a cell.
+        """
+        cells = self.local_pose.metadata.heights
+        shown = [m for m in self.members.on_map() if m.pose is not None]
+        C = np.array([m.pose.map_C for m in shown if m.pose is not None]).reshape(-1, 3)
+        own = np.array([m.id in poses for m in shown], bool)
+        if not own.any():
+            return np.zeros((0, 2), np.int64), np.zeros(0, bool)
+        high = max(float(np.median(C[own, 2])) - self.redraw.canvas.ground, 1.0)
+        low, top = C[own, :2].min(0) - MOST_ASIDE * high, C[own, :2].max(0) + MOST_ASIDE * high
+        places = cells.places((low[0], low[1], top[0], top[1]))
+        if not len(places):
+            return np.zeros((0, 2), np.int64), np.zeros(0, bool)
+        moved = np.array(
+            [
+                np.hypot(*(poses[m.id].map_C - c)[:2]) if m.id in poses else 0.0
+                for m, c in zip(shown, C, strict=True)
+            ]
+        )
+        at = nearest(C[:, :2], places, 1)[1][:, 0]
+        mine = own[at]
+        found = np.floor(places[mine] / cells.cell).astype(np.int64)
+        return found, moved[at[mine]] > cells.cell
 
     def _distance(self, member: Member, change: Change) -> int:
         """Number of stored links on the shortest path between the photos that this one is linked

@@ -9,11 +9,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.geometry.neighbours import nearest
 from skyquilt.model.surface import Surface
 
 Cells = NDArray[np.int64]
 WEIGHT = 0.4
 """Weight of new points in the height of a cell that already has one."""
+AROUND = 9
+"""Cells by which it is told how far heights have moved between them."""
 
 
 BLOCK = 32
@@ -45,8 +48,35 @@ class HeightCells:
         self.put(cells, z)
         return cells, z
 
+    def renew(
+        self, xyz: NDArray[np.float64], own: NDArray[np.int64], gone: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Replaces the heights of all cells `own` (k, 2) of photos that were adjusted together by
+        those of their ground points (P, 3) in m: cells without a point follow those around them up
+        or down; they are removed where that is more than a cell, or `gone` (k,) says so, since the
+        ground that they told of lies elsewhere now.
+
+        Returns the cells touched, (n, 2), and their heights now, (n,) in m; NaN = removed.
+        """
+        before = self.at(own)
+        cells, z = self.add(xyz, anew=True)
+        touched = {*map(tuple, cells.tolist())}
+        rest = np.array([cell not in touched for cell in map(tuple, own.tolist())], bool)
+        step = self.at(own) - before
+        if rest.any():
+            known = np.flatnonzero(~rest)
+            lift = np.full(int(rest.sum()), np.nan)
+            if len(known):
+                _, at = nearest(own[known], own[rest], min(AROUND, len(known)))
+                lift = np.median(step[known][at], axis=1)
+            lift[gone[rest] | ~(np.abs(lift) <= self.cell)] = np.nan
+            self.put(own[rest], before[rest] + lift)
+            cells = np.concatenate([cells, own[rest]])
+            z = np.concatenate([z, before[rest] + lift])
+        return cells, z
+
     def put(self, cells: NDArray[np.int64], z: NDArray[np.float64]) -> None:
-        """Sets cells (k, 2) to heights (k,) in m."""
+        """Sets cells (k, 2) to heights (k,) in m; NaN = without a height."""
         for key, mine, (column, row) in _by_block(cells):
             held = self._blocks.setdefault(key, np.full((BLOCK, BLOCK), np.nan))
             held[row, column] = z[mine]
