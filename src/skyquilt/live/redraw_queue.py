@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,15 +47,20 @@ class RedrawQueue:
         self._to_draw: set[int] = set()
         self._fresh: dict[str, list[Address]] = {}
         self._remarked: set[int] = set()
+        self._astray: set[int] = set()
+        """Photos that tiles may show elsewhere than where they were last reported."""
         self._take_up()
 
     def _take_up(self) -> None:
         rows = self.ledger.rows("select id, footprint from photo where footprint != ''")
         drawn = {int(i): _drawn(d) for i, d in rows}
         for member in self.members.on_map():
+            pose, former = drawn.get(member.id), set[Address]()
             with concerning(member.id):
-                addresses = self.canvas.place(member, self.members.camera(member))
-            pose = drawn.get(member.id)
+                if pose is not None and self.canvas.moved(member, pose):
+                    self.canvas.place(replace(member, pose=pose), self.members.camera(member))
+                    former = self.canvas.remove(member.id)
+                addresses = former | self.canvas.place(member, self.members.camera(member))
             rim = self.canvas.outline(member.id)
             if pose is not None and rim is not None and not self.canvas.moved(member, pose):
                 self._drawn[member.id], self._rims[member.id] = pose, rim
@@ -107,7 +113,7 @@ class RedrawQueue:
         """Notes that a photo has moved; it is drawn again if the change is visible."""
         self._look_for_marks(member)
         drawn = self._drawn.get(member.id)
-        if drawn is None or self.canvas.moved(member, drawn):
+        if drawn is None or member.id in self._astray or self.canvas.moved(member, drawn):
             self.changed(member)
 
     def take_note(self) -> Update:
@@ -121,10 +127,11 @@ class RedrawQueue:
             addresses = self._placed(member)
             remarked = number in self._remarked
             self._remarked.discard(number)
-            if not remarked and self._looks_as_drawn(number):
+            if not remarked and number not in self._astray and self._looks_as_drawn(number):
                 self._to_draw.discard(number)
             else:
                 self._to_draw.add(number)
+                self._astray.add(number)
                 _add(self.dirty, addresses, number)
         return Update(what="noted")
 
@@ -199,6 +206,7 @@ class RedrawQueue:
             self.map_events.tiles(self._fresh.pop(rule, []))
         hit("drawing told")
         self._to_draw.difference_update(shown)
+        self._astray.difference_update(shown)
         return raised
 
     def _waits(self, number: int) -> bool:
