@@ -12,7 +12,7 @@ from skyquilt.live.live_map import LiveMap
 from skyquilt.live.settings import LiveSettings
 from skyquilt.photos.read import read_photo
 from skyquilt.photos.survey import placed_plausibly
-from tests.end_to_end.conftest import taken_apart
+from tests.end_to_end.conftest import relabel, taken_apart
 from tests.photos.conftest import with_segment
 
 LIE_DEG = 40.0
@@ -147,4 +147,69 @@ def test_a_receiver_that_never_moved_tells_no_step(flight, tmp_path):
         live.intake.take_file(path, "drone")
     live.members.take_up()
     assert len(set(map(str, sigmas(live).values()))) == 1 and not notes_of(live)
+    live.close()
+
+
+def first_drawn(live, photos):
+    """The pose with which each photo is drawn first, by name, as photos come one by one."""
+    first = {}
+    honest = live.redraw._drawn_now
+
+    def noted(member):
+        first.setdefault(member.photo.name, member.pose)
+        honest(member)
+
+    live.redraw._drawn_now = noted
+    for path in photos:
+        live.add(path)
+    return first
+
+
+def test_photos_without_headings_are_linked_before_they_are_drawn(flight, tmp_path):
+    """They would be drawn with north at the top; the first one is, since nothing else tells."""
+    photos = []
+    for path in flight.photos[:4]:
+        photos.append(tmp_path / path.name)
+        shutil.copyfile(path, photos[-1])
+        relabel(photos[-1], drop=("xmp",))
+    live = LiveMap(tmp_path / "out", SETTINGS)
+    first = first_drawn(live, photos)
+    live.close()
+    assert [*first] == [p.name for p in photos]
+    yaw = {n: angles_from_cam_R_map(p.cam_R_map)[0] for n, p in first.items()}
+    true = {n: angles_from_cam_R_map(flight.rotation(n))[0] for n in first}
+    off = [abs(angle_difference_deg(yaw[n], true[n])) for n in first]
+    assert off[0] > 10
+    assert max(off[2:]) < 5  # two photos tell their direction by their positions
+
+
+def test_what_metadata_are_worth_tells_whether_photos_are_drawn_by_them(flight, tmp_path):
+    live = LiveMap(tmp_path / "out", SETTINGS)
+    metadata = live.initial_pose.metadata
+    for path in flight.photos[:2]:
+        live.add(path)
+    member = live.members.by_id[2]
+    pose = metadata.first(member)
+    assert not metadata.loose(member, pose)
+    for off in (1.0, 6.0):  # m, of photos that show 72 m
+        metadata._misfit.extend([off] * 60)
+        assert metadata.loose(member, pose) == (off > 3)
+    metadata._misfit.clear()
+    for lift in (0.0, 1.0, 30.0, -20.0, 10.0, -15.0):
+        metadata._recent[f"{member.source}|{member.photo.camera_key}"].append((0.0, lift))
+    assert metadata.loose(member, pose)
+    live.members.by_id[1].tried = 0  # then there is nothing to be linked with
+    live.members.by_id[2].tried = 0
+    assert not metadata.loose(member, pose)
+    live.close()
+
+
+def test_a_photo_that_matches_nothing_is_drawn_by_its_metadata(flight, tmp_path, monkeypatch):
+    live = LiveMap(tmp_path / "out", SETTINGS)
+    live.add(flight.photos[0])
+    monkeypatch.setattr(live.initial_pose.metadata, "loose", lambda *_: True)
+    monkeypatch.setattr(live.live_links, "_compared", lambda a, b: None)
+    first = first_drawn(live, flight.photos[1:2])
+    assert [*first] == [flight.photos[1].name]
+    assert not live.redraw.held
     live.close()

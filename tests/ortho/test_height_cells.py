@@ -59,3 +59,47 @@ def test_what_is_known_within_absurd_bounds_is_found_at_once():
     order = np.lexsort(places.T)
     assert cells.places(everywhere).tolist() == (places[order] + 0.5).tolist()
     assert cells.places((-5.0, 0.0, 31.0, 31.9)).tolist() == [[0.5, 0.5], [-4.5, 3.5]]
+
+
+def block(rng, cells, z):
+    """Points about the middles of cells (k, 2), of these heights (k,)."""
+    return np.column_stack([cells + rng.uniform(0.3, 0.7, cells.shape), z])
+
+
+def test_cells_without_points_follow_those_around_them():
+    """What is known of the ground between tie points rises with it, and cells of others stay."""
+    rng = np.random.default_rng(1)
+    own = np.stack(np.meshgrid(np.arange(20), np.arange(20)), -1).reshape(-1, 2)
+    other = own + (40, 0)
+    relief = 3 * np.sin(own[:, 0] / 3)
+    cells = HeightCells(cell=1.0)
+    cells.put(own, relief)
+    cells.put(other, relief)
+    met = rng.random(len(own)) < 0.3
+    lift = 0.5 + 0.02 * own[:, 1]
+    touched, z = cells.renew(
+        block(rng, own[met], relief[met] + lift[met]), own, np.zeros(400, bool)
+    )
+    assert {*map(tuple, touched.tolist())} == {*map(tuple, own.tolist())}
+    assert np.array_equal(cells.at(touched), z)
+    assert np.abs(cells.at(own) - relief - lift).max() < 0.1
+    assert np.array_equal(cells.at(other), relief)
+
+
+@pytest.mark.parametrize("how", ["far up", "aside", "nothing in common"])
+def test_cells_whose_ground_lies_elsewhere_now_are_removed(how):
+    """By 70 m of height, or below photos that moved away: former heights would stand out."""
+    rng = np.random.default_rng(2)
+    own = np.stack(np.meshgrid(np.arange(20), np.arange(20)), -1).reshape(-1, 2)
+    cells = HeightCells(cell=1.0)
+    cells.put(own, np.full(400, 270.0))
+    met = own[rng.random(len(own)) < 0.3]
+    now = met + (100, 0) if how == "nothing in common" else met
+    height = 340.0 if how == "far up" else 270.0
+    xyz = block(rng, now, np.full(len(met), height))
+    gone = np.full(400, how == "aside")
+    touched, z = cells.renew(xyz, own, gone)
+    left = cells.at(own)
+    assert set(left[np.isfinite(left)]) <= {height}
+    assert np.isfinite(left).sum() == (0 if how == "nothing in common" else len(met))
+    assert np.isnan(z).sum() == 400 - np.isfinite(left).sum()

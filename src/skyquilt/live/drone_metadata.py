@@ -24,6 +24,10 @@ NOMINAL_M = 50.0
 """Assumed height above ground in m where the metadata do not contain one."""
 RECENT = 15
 """Number of recent photos of one source from which the correction of the next photo is computed."""
+LOOSE, LOOSE_HIGH = 0.03, 0.2
+"""Standard deviation of positions, as a share of a photo's width on the ground, and of heights, as
+one of that above it, from which half of all photos lie visibly beside their neighbours.
+"""
 
 
 class Metadata:
@@ -92,6 +96,22 @@ class Metadata:
         lifts = np.array([x for _, x in found])
         lift = float(np.median(lifts[np.isfinite(lifts)])) if np.isfinite(lifts).any() else np.nan
         return (turn if abs(turn) > 10 else 0.0), lift
+
+    def loose(self, member: Member, pose: Pose) -> bool:
+        """Whether a photo will most likely lie beside its neighbours by this pose, from its
+        metadata: its heading is not known, or positions or heights of photos before it were badly
+        off. False where there is no photo to be linked with.
+        """
+        if not any(m.tried for m in self.members.on_map()):
+            return False
+        if not np.isfinite(member.prior.yaw_deg):
+            return True
+        above = max(float(pose.map_C[2]) - self.ground_at(pose.map_C), 2.0)
+        if self.scatter() > LOOSE * above * member.photo.width / member.photo.focal.px:
+            return True
+        found = self._recent.get(f"{member.source}|{member.photo.camera_key}", ())
+        lifts = np.array([x for _, x in found if np.isfinite(x)])
+        return len(lifts) > 2 and float(np.abs(np.diff(lifts)).mean()) > LOOSE_HIGH * above
 
     def learn(self, member: Member) -> None:
         """Compares the metadata of a photo with its refined pose; stores the differences in

@@ -22,6 +22,10 @@ from skyquilt.photos.implausible_positions import on_sphere
 
 FEW = 10
 """A map with at most so many photos is begun again where more of them lie elsewhere."""
+AT_ONCE = 3
+"""A photo whose metadata are not worth much is linked before it is drawn, unless more photos wait for
+that.
+"""
 BEGAN, NO_PLACE = "begun at", "no place told"
 """Names in the ledger: the photo around which the map was begun again; whether it was said that no
 photo has a position.
@@ -80,7 +84,11 @@ class InitialPose:
         self.queues.received.popleft()
         self.queues.untried.append(member)
         if pose is not None:
-            self.redraw.show(member)
+            few = len(self.queues.received) + len(self.queues.untried) <= AT_ONCE
+            if few and known is None and self.metadata.loose(member, pose):
+                self.redraw.held.add(member.id)
+            else:
+                self.redraw.show(member)
         return Update(what=member.state, photo=member.id, text=warning or why)
 
     def elsewhere(self, member: Member) -> bool:

@@ -42,6 +42,8 @@ class RedrawQueue:
         self.dirty: Queue = {}
         self.later: Queue = {a: set() for a in canvas.owed()}
         self.pending: dict[int, None] = {}
+        self.held: set[int] = set()
+        """Photos on the map that are drawn only after they are compared with their neighbours."""
         self._drawn: dict[int, Pose] = {}
         self._rims: dict[int, NDArray[np.float64]] = {}
         self._to_draw: set[int] = set()
@@ -71,6 +73,7 @@ class RedrawQueue:
     def show(self, member: Member) -> None:
         """Queues the tiles of a new photo as urgent."""
         self._look_for_marks(member)
+        self.held.discard(member.id)
         self._to_draw.add(member.id)
         _add(self.urgent, self._placed(member), member.id)
 
@@ -110,10 +113,15 @@ class RedrawQueue:
         self.pending[member.id] = None
 
     def moved(self, member: Member) -> None:
-        """Notes that a photo has moved; it is drawn again if the change is visible."""
-        self._look_for_marks(member)
+        """Notes that a photo has moved; it is drawn again if the change is visible, and at once if
+        it was not drawn yet.
+        """
         drawn = self._drawn.get(member.id)
-        if drawn is None or member.id in self._astray or self.canvas.moved(member, drawn):
+        if drawn is None:
+            self.show(member)
+            return
+        self._look_for_marks(member)
+        if member.id in self._astray or self.canvas.moved(member, drawn):
             self.changed(member)
 
     def take_note(self) -> Update:
@@ -146,6 +154,7 @@ class RedrawQueue:
 
     def gone(self, number: int) -> None:
         """Removes a photo."""
+        self.held.discard(number)
         _add(self.dirty, self.canvas.remove(number), number)
 
     def clear(self) -> None:

@@ -60,6 +60,8 @@ class Refinement:
         change = self.local_pose.refine(member)
         found = self._found(member, change)
         self._commit(member, change, found)
+        if member.id in self.redraw.held:  # it is linked with none: by its metadata then
+            self.redraw.show(member)
         self.queues.untried.popleft()
         self._requeue(member, found)
         alone = "waiting" if self.members.frame is None else "loose"
