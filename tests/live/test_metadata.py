@@ -180,7 +180,7 @@ def test_photos_without_headings_are_linked_before_they_are_drawn(flight, tmp_pa
     true = {n: angles_from_cam_R_map(flight.rotation(n))[0] for n in first}
     off = [abs(angle_difference_deg(yaw[n], true[n])) for n in first]
     assert off[0] > 10
-    assert max(off[2:]) < 5  # two photos tell their direction by their positions
+    assert max(off[2:]) < 10  # two photos tell their direction by their positions
 
 
 def test_what_metadata_are_worth_tells_whether_photos_are_drawn_by_them(flight, tmp_path):
