@@ -4,7 +4,7 @@ python benchmarks/live_places.py FLIGHT [--rate 1]     a simulated flight, again
 python benchmarks/live_places.py SURVEY --run RUN      photos, against the finished map of a run
     [--order shuffled|bursts]                          photos out of order, or ten at once
     [--without positions]                              photos that tell no position
-    [--pictures FOLDER]                                the map as PNG after every sixth of the photos
+    [--pictures FOLDER]                                the map as PNG after each sixth of photos
     [--json FILE]                                      the figures besides
 
 Photos arrive at a rate in real time. Seams: a photo is off its neighbours where the ground between
@@ -274,7 +274,7 @@ def picture(live: LiveMap, path: Path) -> None:
     """Writes what the map shows, about 1600 px wide."""
     for layer in live.tiles.layers():
         for level in range(8):
-            at = [a for a in live.tiles.addresses(layer, level)]
+            at = live.tiles.addresses(layer, level)
             if at and max(max(a.col for a in at) - min(a.col for a in at), 1) <= 7:
                 break
         if not at or "newest" in layer:
@@ -368,6 +368,11 @@ def main() -> None:
         print(
             "  worst at the end:", ", ".join(f"{n} {ends[n] * truth.width[n]:.1f} m" for n in worst)
         )
+    for name, reason in live.ledger.rows("select name, reason from photo where state = 'refused'"):
+        print(f"  {name} was refused: {reason}")
+    log = home / "out" / "errors.log"
+    if log.exists():
+        print(log.read_text())
     if asked.json:
         asked.json.write_text(json.dumps(found))
     live.close()

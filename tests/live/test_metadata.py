@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 
+import numpy as np
 import piexif
 import pytest
 
@@ -183,7 +184,9 @@ def test_photos_without_headings_are_linked_before_they_are_drawn(flight, tmp_pa
     assert max(off[2:]) < 10  # two photos tell their direction by their positions
 
 
-def test_what_metadata_are_worth_tells_whether_photos_are_drawn_by_them(flight, tmp_path):
+def test_what_metadata_are_worth_tells_whether_photos_are_drawn_by_them(
+    flight, tmp_path, monkeypatch
+):
     live = LiveMap(tmp_path / "out", SETTINGS)
     metadata = live.initial_pose.metadata
     for path in flight.photos[:2]:
@@ -195,9 +198,13 @@ def test_what_metadata_are_worth_tells_whether_photos_are_drawn_by_them(flight, 
         metadata._misfit.extend([off] * 60)
         assert metadata.loose(member, pose) == (off > 3)
     metadata._misfit.clear()
-    for lift in (0.0, 1.0, 30.0, -20.0, 10.0, -15.0):
-        metadata._recent[f"{member.source}|{member.photo.camera_key}"].append((0.0, lift))
-    assert metadata.loose(member, pose)
+    assert not metadata.loose(member, pose)
+    monkeypatch.setattr(metadata, "_learned", lambda _: np.array([[0.0] * 4, [0, 30, -20, 15], z]))
+    for z in ([60, 60, 60, 60], [90, 20, 60, 40]):  # level, at heights badly reported; all over
+        assert metadata.loose(member, pose) == (z[0] == 90)
+    assert metadata.first(member).map_C[2] == member.prior.map_C[2] + 7.5
+    z = [60, 61, 60, 59]
+    assert metadata.first(member).map_C[2] == 60
     live.members.by_id[1].tried = 0  # then there is nothing to be linked with
     live.members.by_id[2].tried = 0
     assert not metadata.loose(member, pose)

@@ -11,6 +11,7 @@ from skyquilt.live.ledger import hit
 from skyquilt.live.members import Member, about_record
 from skyquilt.live.refinement import Refinement
 from skyquilt.live.settings import CLOSING
+from skyquilt.model.poses import Pose
 
 
 class ApplyAdjustment:
@@ -31,9 +32,13 @@ class ApplyAdjustment:
         )
 
     def apply(self, done: BlockAdjustment) -> Update:
-        """Applies the result in one transaction."""
+        """Applies the result in one transaction; not one of photos that have all been adjusted since
+        it began, together with others that the job did not know.
+        """
         if not done.poses:
             return self._failed(done.problem)
+        if all(_differs(self.members.by_id[i].pose, done.before.get(i)) for i in done.poses):
+            return self._failed("all of it has been adjusted with more photos since")
         before = {i: self.members.by_id[i].pose for i in done.poses}
         steps = {
             i: p.map_C - old.map_C for i, p in done.poses.items() if (old := before[i]) is not None
@@ -83,3 +88,12 @@ class ApplyAdjustment:
             member.tried = 0
             self.members.save(member, about=about_record(member, ""))
             self.queues.untried.append(member)
+
+
+def _differs(pose: Pose | None, before: Pose | None) -> bool:
+    if pose is None or before is None:
+        return pose is not before
+    return not (
+        np.array_equal(pose.map_C, before.map_C)
+        and np.array_equal(pose.cam_R_map, before.cam_R_map)
+    )

@@ -6,7 +6,7 @@ neighbours when the result is applied.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -89,6 +89,8 @@ class BlockAdjustment:
     """Name of the calibration of each moved photo."""
     xyz: NDArray[np.float64]
     """(P, 3) ground points in m."""
+    before: dict[int, Pose] = field(default_factory=dict)
+    """Poses when the job began."""
     problem: str = ""
     """Why there is no result; empty where there is one."""
 
@@ -105,7 +107,8 @@ def adjust_block(job: AdjustmentJob) -> BlockAdjustment:
             folder=job.store, registry={c.__name__: c for c in (PhotoFeatures, Features, Surface)}
         )
         features = [_features(p, store, job.methods) for p in job.photos]
-        return _part(job, links, features) if job.held else _whole(job, links, features, store)
+        done = _part(job, links, features) if job.held else _whole(job, links, features, store)
+        return replace(done, before=job.poses)
     except (AlignmentError, SkyquiltError, np.linalg.LinAlgError, ValueError) as error:
         return _nothing(job.ids, str(error))
 

@@ -28,6 +28,10 @@ LOOSE, LOOSE_HIGH = 0.03, 0.2
 """Standard deviation of positions, as a share of a photo's width on the ground, and of heights, as
 one of that above it, from which half of all photos lie visibly beside their neighbours.
 """
+LEVEL, LEVEL_M, FEWEST = 2.0, 3.0, 3
+"""Drones that flew level by what is refined, so many times better than heights are reported, go on
+at that level; deviation (m) of reported heights from which that is asked; photos that tell it.
+"""
 
 
 class Metadata:
@@ -36,9 +40,8 @@ class Metadata:
     def __init__(self, members: Members, heights: HeightCells, settings: LiveSettings) -> None:
         """Reads what was learned before a restart, in the same order."""
         self.members, self.heights, self.settings = members, heights, settings
-        self._recent: dict[str, deque[tuple[float, float]]] = defaultdict(
-            lambda: deque(maxlen=RECENT)
-        )
+        self._recent: dict[str, dict[int, Member]] = defaultdict(dict)
+        """Photos of each source that were refined last, the last one at the end."""
         self._misfit: deque[float] = deque(maxlen=60)
         for member in sorted(members.by_id.values(), key=lambda m: m.tried):
             self._remember(member)
@@ -68,11 +71,13 @@ class Metadata:
         prior = member.prior
         if not np.isfinite(prior.map_C[:2]).all():
             return None
-        turn, lift = self._corrections(member)
+        turn, lift, level = self._corrections(member)
         yaw = prior.yaw_deg - turn if np.isfinite(prior.yaw_deg) else 0.0
         datum = self.members.frame.vertical_datum if self.members.frame else "unknown"
         z = prior.map_C[2]
-        if np.isfinite(lift):
+        if np.isfinite(level):
+            z = level
+        elif np.isfinite(lift):
             z = z + lift if np.isfinite(z) else lift
         elif not np.isfinite(z) or (datum == "takeoff" and z < 3):
             z = self.ground_at(prior.map_C) + NOMINAL_M
@@ -83,19 +88,30 @@ class Metadata:
         )
         return Pose(cam_R_map=R, map_C=np.array([prior.map_C[0], prior.map_C[1], z]))
 
-    def _corrections(self, member: Member) -> tuple[float, float]:
-        """Error of the headings (deg) and heights (m) that recent photos of the source reported."""
-        found = self._recent.get(f"{member.source}|{member.photo.camera_key}")
-        if not found:
-            return 0.0, np.nan
-        turns = np.array([t for t, _ in found][-3:])
-        turns = turns[np.isfinite(turns)]
-        unit = np.exp(1j * np.radians(turns))
-        agreed = len(turns) > 0 and abs(unit.mean()) > 0.97
+    def _corrections(self, member: Member) -> tuple[float, float, float]:
+        """Error of the headings (deg) and heights (m) that recent photos of the source reported,
+        and the height (m) at which they flew if that tells more, otherwise NaN.
+        """
+        turns, lifts, z = self._learned(member)
+        last = turns[-3:][np.isfinite(turns[-3:])]
+        unit = np.exp(1j * np.radians(last))
+        agreed = len(last) > 0 and abs(unit.mean()) > 0.97
         turn = float(np.degrees(np.angle(unit.mean()))) if agreed else 0.0
-        lifts = np.array([x for _, x in found])
-        lift = float(np.median(lifts[np.isfinite(lifts)])) if np.isfinite(lifts).any() else np.nan
-        return (turn if abs(turn) > 10 else 0.0), lift
+        known = np.isfinite(lifts)
+        lift = float(np.median(lifts[known])) if known.any() else np.nan
+        level = float(np.median(z[known])) if _level(lifts[known], z[known]) else np.nan
+        return (turn if abs(turn) > 10 else 0.0), lift, level
+
+    def _learned(self, member: Member) -> NDArray[np.float64]:
+        """(3, n) of recent photos of the same source: errors of their headings (deg) when they were
+        refined, and of their heights (m), and these heights, as the map has them now.
+        """
+        rows = []
+        for other in self._recent[_source(member)].values():
+            if other.learned is not None and other.pose is not None:
+                z, told = float(other.pose.map_C[2]), float(other.prior.map_C[2])
+                rows.append((other.learned[0], z - told if np.isfinite(told) else z, z))
+        return np.array(rows, np.float64).reshape(-1, 3).T
 
     def loose(self, member: Member, pose: Pose) -> bool:
         """Whether a photo will most likely lie beside its neighbours by this pose, from its
@@ -109,9 +125,11 @@ class Metadata:
         above = max(float(pose.map_C[2]) - self.ground_at(pose.map_C), 2.0)
         if self.scatter() > LOOSE * above * member.photo.width / member.photo.focal.px:
             return True
-        found = self._recent.get(f"{member.source}|{member.photo.camera_key}", ())
-        lifts = np.array([x for _, x in found if np.isfinite(x)])
-        return len(lifts) > 2 and float(np.abs(np.diff(lifts)).mean()) > LOOSE_HIGH * above
+        _, lifts, z = self._learned(member)
+        lifts, z = lifts[np.isfinite(lifts)], z[np.isfinite(lifts)]
+        if len(lifts) < FEWEST:
+            return False
+        return float(min(_scatter(lifts), _scatter(z))) > LOOSE_HIGH * above
 
     def learn(self, member: Member) -> None:
         """Compares the metadata of a photo with its refined pose; stores the differences in
@@ -132,8 +150,12 @@ class Metadata:
     def _remember(self, member: Member) -> None:
         if member.learned is None:
             return
-        turn, lift, misfit = member.learned
-        self._recent[f"{member.source}|{member.photo.camera_key}"].append((turn, lift))
+        recent = self._recent[_source(member)]
+        recent.pop(member.id, None)
+        recent[member.id] = member
+        if len(recent) > RECENT:
+            del recent[next(iter(recent))]
+        misfit = member.learned[2]
         if np.isfinite(misfit):
             self._misfit.append(misfit)
 
@@ -153,3 +175,17 @@ class Metadata:
         photos.
         """
         return float(np.median(self._misfit)) / 1.18 if len(self._misfit) >= 5 else 0.0
+
+
+def _source(member: Member) -> str:
+    return f"{member.source}|{member.photo.camera_key}"
+
+
+def _scatter(values: NDArray[np.float64]) -> float:
+    """Median deviation from the median."""
+    return float(np.median(np.abs(values - np.median(values))))
+
+
+def _level(lifts: NDArray[np.float64], z: NDArray[np.float64]) -> bool:
+    """Whether the heights of photos (m) scatter far less than the errors of reported ones."""
+    return len(z) >= FEWEST and _scatter(lifts) > max(LEVEL * _scatter(z), LEVEL_M)

@@ -23,8 +23,8 @@ from skyquilt.photos.implausible_positions import on_sphere
 FEW = 10
 """A map with at most so many photos is begun again where more of them lie elsewhere."""
 AT_ONCE = 3
-"""A photo whose metadata are not worth much is linked before it is drawn, unless more photos wait for
-that.
+"""A photo whose metadata are worth little is linked before it is drawn, unless more photos than so
+many wait for that.
 """
 BEGAN, NO_PLACE = "begun at", "no place told"
 """Names in the ledger: the photo around which the map was begun again; whether it was said that no
