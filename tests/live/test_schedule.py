@@ -1,12 +1,17 @@
 """Which block is adjusted as a whole next."""
 
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from skyquilt.live.adjustment_schedule import Blocks, Schedule
+from skyquilt.live.apply_adjustment import ApplyAdjustment
+from skyquilt.live.background_adjustment import BlockAdjustment
 from skyquilt.live.settings import CLOSING, GROWTH, PART, LiveSettings
+from skyquilt.model.poses import Pose
 from skyquilt.settings import MosaicSettings
 from skyquilt.workflows.methods import methods_for
 
@@ -58,3 +63,41 @@ def test_a_loop_comes_first():
     blocks = blocks_of(13, 12, closed=(13, 3), loop=5)
     assert blocks.due(0.0, idle=False)[0] == list(range(1, 14))
     assert blocks.schedule.loop is None
+
+
+@pytest.mark.parametrize("since", ["none", "one", "all"])
+def test_what_was_adjusted_anew_in_the_meantime_is_not_put_back(since):
+    """A job on three photos ends when twelve have been adjusted together."""
+
+    def pose(x):
+        return Pose(cam_R_map=np.diag([1.0, -1.0, -1.0]), map_C=np.array([x, 0.0, 50.0]))
+
+    before = {i: pose(10.0 * i) for i in (1, 2, 3)}
+    now = {"none": (), "one": (2,), "all": (1, 2, 3)}[since]
+    by_id = {i: SimpleNamespace(pose=pose(10.0 * i + (i in now))) for i in before}
+    done = BlockAdjustment(
+        ids=(1, 2, 3),
+        poses={i: pose(10.0 * i + 5) for i in before},
+        cameras={},
+        camera_of={},
+        xyz=np.zeros((0, 3)),
+        before=before,
+    )
+    stored = []
+    schedule = Schedule(since=4)
+    schedule.begun(1, 3)
+    refinement = SimpleNamespace(
+        members=SimpleNamespace(
+            by_id=by_id, block=lambda i: {1, 2, 3}, save_cameras=lambda cameras: None
+        ),
+        ledger=SimpleNamespace(change=nullcontext, put_meta=lambda *a: None, tell=lambda *a: None),
+        schedule=schedule,
+        redraw=None,
+        queues=None,
+        heights=lambda *a, **k: None,
+        move=lambda poses, camera_of: stored.append(poses),
+    )
+    update = ApplyAdjustment(refinement).apply(done)
+    assert bool(stored) == (since != "all")
+    assert update.what == ("noted" if since == "all" else "closed")
+    assert schedule.under_way is None

@@ -32,8 +32,8 @@ class ApplyAdjustment:
         )
 
     def apply(self, done: BlockAdjustment) -> Update:
-        """Applies the result in one transaction; not one of photos that have all been adjusted since
-        it began, together with others that the job did not know.
+        """Applies the result in one transaction; not one of photos that have all been adjusted
+        since it began, together with others that the job did not know.
         """
         if not done.poses:
             return self._failed(done.problem)
