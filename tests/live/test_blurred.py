@@ -2,6 +2,7 @@
 
 import io
 import json
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ from skyquilt.live.live_map import LiveMap
 from skyquilt.live.settings import LiveSettings
 from skyquilt.live.tile_drawing import WHOLE
 from skyquilt.live.veils import LiveVeils
+from skyquilt.model.features import Link
 from skyquilt.ortho.blend import Feather
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, Route
@@ -130,3 +132,33 @@ def test_blurred_photos_alone_are_told_and_a_restart_knows_them(maps, tmp_path):
     assert known.blurred == blur.refinement.blur.blurred == {k + 1 for k in SPOILT}
     for member in blur.members.by_id.values():  # judged anew, each verdict is the same
         assert not known.look(member)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_the_order_in_which_two_photos_were_linked_does_not_matter(turned):
+    """A photo that was refined again is the first one of its new links; it had been refused where
+    it has fewer features than the other, or compared at wrong places.
+    """
+    rng = np.random.default_rng(0)
+    px = {i: rng.uniform(5, 475, (n, 2)) for i, n in ((1, 90), (2, 300))}
+    sharp = {1: 1.0, 2: 2.0}  # where it shows what the other one does; elsewhere it is blank
+    detail = {i: np.full((48, 48, 3), np.nan) for i in px}
+    index = {1: np.arange(80), 2: np.arange(200, 280)}
+    for i in px:
+        row, column = np.floor((px[i][index[i]] + 0.5) / 10).astype(int).T[::-1]
+        detail[i][row, column] = sharp[i]
+    photo = SimpleNamespace(width=480, height=480)
+    a, b = (2, 1) if turned else (1, 2)
+    link = Link(a=a, b=b, index_a=index[a], index_b=index[b], b_S_a=1 + 0j)
+    live_links = SimpleNamespace(
+        members=SimpleNamespace(
+            by_id={i: SimpleNamespace(photo=photo) for i in px},
+            ledger=SimpleNamespace(meta=lambda key: None),
+        ),
+        link=lambda *_: link,
+        features=lambda i: SimpleNamespace(px=px[i]),
+        detail=detail.__getitem__,
+    )
+    blur = LiveBlur(live_links)
+    assert blur._lacks(1, 2) == pytest.approx([1.0, 1.0])
+    assert blur._lacks(2, 1) == pytest.approx([-1.0, -1.0])

@@ -89,7 +89,8 @@ class LiveBlur:
         link = self.live_links.link(a, b)
         if link is None:
             return None
-        shown = [self._detail(i, px) for i, px in ((a, link.index_a), (b, link.index_b))]
+        matched = {link.a: link.index_a, link.b: link.index_b}  # a photo that waited is its first
+        shown = [self._detail(i, matched[i]) for i in (a, b)]
         off = shown[1] - shown[0]
         off = off[np.isfinite(off).all(1)]
         return np.asarray(np.median(off, axis=0)) if len(off) >= FEWEST_CELLS else None
