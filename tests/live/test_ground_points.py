@@ -1,10 +1,13 @@
 """Ground points of the growing map lie under its photos."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from skyquilt.live.refinement import on_ground
+from skyquilt.live.refinement import Refinement, on_ground
 from skyquilt.model.poses import Pose
+from skyquilt.ortho.height_cells import HeightCells
 
 GROUND = 440.0
 
@@ -41,3 +44,29 @@ def test_nothing_is_judged_without_photos():
     assert on_ground(bad, {}, GROUND) is bad
     none = np.zeros((0, 3))
     assert on_ground(none, poses(60.0), GROUND) is none
+
+
+def test_ground_belongs_to_the_photos_that_are_nearest():
+    """Two blocks side by side: the ground below one is told anew, but where one of its photos moves
+    aside that below it is forgotten.
+    """
+    before = poses(60.0)
+    other = {
+        i + 10: Pose(cam_R_map=p.cam_R_map, map_C=p.map_C + [0, 80, 0]) for i, p in before.items()
+    }
+    shown = [SimpleNamespace(id=i, pose=p) for i, p in (before | other).items()]
+    cells = HeightCells(cell=4.0)
+    known = np.stack(np.meshgrid(np.arange(-5, 30), np.arange(-10, 30)), -1).reshape(-1, 2)
+    cells.put(known, np.full(len(known), GROUND))
+    refinement = object.__new__(Refinement)
+    refinement.members = SimpleNamespace(on_map=lambda: shown)
+    refinement.local_pose = SimpleNamespace(metadata=SimpleNamespace(heights=cells))
+    refinement.redraw = SimpleNamespace(canvas=SimpleNamespace(ground=GROUND))
+    after = before | {5: Pose(cam_R_map=before[5].cam_R_map, map_C=before[5].map_C + [9, 0, 0])}
+    own, gone = refinement._ground_of(after)
+    middle = (own + 0.5) * 4
+    assert len(own) == (((known + 0.5) * 4)[:, 1] < 40).sum()
+    assert (middle[:, 1] < 40).all()
+    between = middle[:, 0] == 90
+    assert np.array_equal(gone[~between], middle[~between, 0] > 90)
+    assert len(refinement._ground_of({})[0]) == 0
