@@ -65,9 +65,14 @@ def test_a_loop_comes_first():
     assert blocks.schedule.loop is None
 
 
-@pytest.mark.parametrize("since", ["none", "one", "all"])
-def test_what_was_adjusted_anew_in_the_meantime_is_not_put_back(since):
-    """A job on three photos ends when twelve have been adjusted together."""
+@pytest.mark.parametrize(
+    ("since", "cell", "dropped"),
+    [("none", 2.0, False), ("one", 2.0, False), ("all", 2.0, True), ("all", 20.0, False)],
+)
+def test_what_was_adjusted_anew_in_the_meantime_is_not_put_back(since, cell, dropped):
+    """A job on three photos ends when twelve have been adjusted together: it would move them by
+    4 m.
+    """
 
     def pose(x):
         return Pose(cam_R_map=np.diag([1.0, -1.0, -1.0]), map_C=np.array([x, 0.0, 50.0]))
@@ -92,12 +97,13 @@ def test_what_was_adjusted_anew_in_the_meantime_is_not_put_back(since):
         ),
         ledger=SimpleNamespace(change=nullcontext, put_meta=lambda *a: None, tell=lambda *a: None),
         schedule=schedule,
+        local_pose=SimpleNamespace(metadata=SimpleNamespace(heights=SimpleNamespace(cell=cell))),
         redraw=None,
         queues=None,
         heights=lambda *a, **k: None,
         move=lambda poses, camera_of: stored.append(poses),
     )
     update = ApplyAdjustment(refinement).apply(done)
-    assert bool(stored) == (since != "all")
-    assert update.what == ("noted" if since == "all" else "closed")
+    assert bool(stored) != dropped
+    assert update.what == ("noted" if dropped else "closed")
     assert schedule.under_way is None

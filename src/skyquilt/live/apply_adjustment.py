@@ -13,6 +13,9 @@ from skyquilt.live.refinement import Refinement
 from skyquilt.live.settings import CLOSING
 from skyquilt.model.poses import Pose
 
+OUTDATED = 0.5
+"""Cells of heights by which a result lies elsewhere than its photos do now."""
+
 
 class ApplyAdjustment:
     """Stores the new poses of a block. Photos that were placed during the job move with their
@@ -32,12 +35,10 @@ class ApplyAdjustment:
         )
 
     def apply(self, done: BlockAdjustment) -> Update:
-        """Applies the result in one transaction; not one of photos that have all been adjusted
-        since it began, together with others that the job did not know.
-        """
+        """Applies the result in one transaction, unless it is out of date."""
         if not done.poses:
             return self._failed(done.problem)
-        if all(_differs(self.members.by_id[i].pose, done.before.get(i)) for i in done.poses):
+        if self._outdated(done):
             return self._failed("all of it has been adjusted with more photos since")
         before = {i: self.members.by_id[i].pose for i in done.poses}
         steps = {
@@ -58,6 +59,21 @@ class ApplyAdjustment:
         if done.cameras:  # heights and calibrations changed: redraw the whole block
             self._show(done)
         return Update(what="closed", moved=tuple(done.poses), text=text)
+
+    def _outdated(self, done: BlockAdjustment) -> bool:
+        """Whether all its photos have been adjusted since the job began, together with others that
+        it did not know, and lie elsewhere now.
+        """
+        now = [self.members.by_id[i].pose for i in done.poses]
+        if not all(_differs(p, done.before.get(i)) for i, p in zip(done.poses, now, strict=True)):
+            return False
+        off = [
+            np.linalg.norm(p.map_C - new.map_C)
+            for new, p in zip(done.poses.values(), now, strict=True)
+            if p is not None
+        ]
+        cell = self.refinement.local_pose.metadata.heights.cell
+        return bool(off) and float(np.median(off)) > OUTDATED * cell
 
     def _failed(self, problem: str) -> Update:
         self.schedule.ended()
