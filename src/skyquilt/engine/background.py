@@ -98,8 +98,9 @@ def serve() -> None:
     os.dup2(2, 1)  # output printed by libraries must not mix with the result
     work, argument = pickle.load(sys.stdin.buffer)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    with answer:
-        pickle.dump(work(argument), answer)
+    done = work(argument)
+    with suppress(BrokenPipeError), answer:  # the parent has ended meanwhile
+        pickle.dump(done, answer)
 
 
 def _end_with_parent() -> None:
