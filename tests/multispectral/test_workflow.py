@@ -9,7 +9,7 @@ from benchmarks.multispectral import judged
 
 from skyquilt.errors import UsageError
 from skyquilt.model.event import Note, Result, StageStarted
-from skyquilt.multispectral import workflow
+from skyquilt.multispectral import placing, workflow
 from skyquilt.multispectral.workflow import iter_bands
 from skyquilt.runs.layers import layers_in
 from skyquilt.settings import MosaicSettings
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.slow
 def few_pairs():
     """So that cameras are found sooner."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(workflow, "MOST_PAIRS", 3)
+        patch.setattr(placing, "MOST_PAIRS", 3)
         yield
 
 

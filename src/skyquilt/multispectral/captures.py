@@ -9,7 +9,13 @@ from numpy.typing import NDArray
 
 from skyquilt.errors import UnreadablePhotoError
 from skyquilt.model.photo import Photo
-from skyquilt.multispectral.reflectance import Kind, Reflectance, common_kind, smoothed_irradiance
+from skyquilt.multispectral.reflectance import (
+    KINDS,
+    Kind,
+    Reflectance,
+    common_kind,
+    smoothed_irradiance,
+)
 from skyquilt.photos.band_tags import BandTags, canonical, read_band_tags
 from skyquilt.photos.together import taken_together
 
@@ -41,9 +47,26 @@ class BandFiles:
         """What the values of all its files can be taken for."""
         return common_kind(self.converts)
 
+    @property
+    def order(self) -> tuple[float, str]:
+        """Its place among the bands: by wavelength, usual ones where no file tells it."""
+        return self.wavelength_nm or _USUAL.get(self.name, 1e9), self.name
+
+    def only(self, kept: Sequence[int]) -> "BandFiles":
+        """The band with these of its files."""
+        return replace(
+            self,
+            photos=tuple(self.photos[j] for j in kept),
+            tags=tuple(self.tags[j] for j in kept),
+            converts=tuple(self.converts[j] for j in kept),
+        )
+
     def as_kind(self, kind: Kind) -> "BandFiles":
-        """The band with values of a weaker kind."""
-        return replace(self, converts=tuple(c.as_kind(kind) for c in self.converts))
+        """The band with values of a weaker kind, save for files whose kind is weaker still."""
+        return replace(
+            self,
+            converts=tuple(c.as_kind(min(kind, c.kind, key=KINDS.index)) for c in self.converts),
+        )
 
 
 def bands_of_files(photos: Sequence[Photo]) -> tuple[BandFiles, ...]:
@@ -64,8 +87,7 @@ def bands_of_files(photos: Sequence[Photo]) -> tuple[BandFiles, ...]:
         )
         for name, files in named.items()
     ]
-    unknown = 1e9
-    return tuple(sorted(found, key=lambda b: b.wavelength_nm or _USUAL.get(b.name, unknown)))
+    return tuple(sorted(found, key=lambda b: b.order))
 
 
 _USUAL = {

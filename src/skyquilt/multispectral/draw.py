@@ -1,13 +1,13 @@
 """bands.tif: all bands on the map's grid, and a raster for each index of vegetation.
 
 In every band each place is shown from the same capture, that of the map, so that a quotient of
-bands compares pixels that were exposed together. Where a band's frame does not reach so far, it
-takes the capture that shows the place from most above.
+bands compares pixels that were exposed together. Where a band's frame does not reach so far, or is
+saturated, it takes the capture that shows the place from most above.
 """
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from skyquilt.engine.folder import STATE
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.workers import Workers
 from skyquilt.errors import PhotoFailedError
-from skyquilt.imaging.nodes import View
+from skyquilt.imaging.nodes import STEP, View
 from skyquilt.imaging.views import make_views
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, Pose, no_ties
@@ -48,8 +48,11 @@ class PlacedBand:
     """Its files."""
     of_photo: dict[int, int]
     """Index of the map's photo -> index of the file of the same capture."""
-    rig: BandRig | None
-    """Its camera beside that of the map's photos; None = the map's photos are its files."""
+    rigs: dict[int, BandRig] = field(default_factory=dict)
+    """Its camera beside that of the map's photo, by the latter's index: one for all, unless files
+    are of several cameras; empty where the map's photos are its files."""
+    saturated: float = 0.0
+    """Share of saturated pixels in its files."""
 
     def without(self, name: str) -> "PlacedBand":
         """The band without a file that cannot be read."""
@@ -60,20 +63,24 @@ class PlacedBand:
 def aligned_band(band: PlacedBand, placed: Alignment) -> Alignment:
     """The poses of a band's files, by the indices of the map's photos."""
     of_photo = [i for i in band.of_photo if i in placed.poses]
-    if band.rig is None:
+    if not band.rigs:
         return replace(placed, poses={i: placed.poses[i] for i in of_photo})
-    rotation = band.rig.b_R_a
     poses = {
-        i: Pose(cam_R_map=rotation @ placed.poses[i].cam_R_map, map_C=placed.poses[i].map_C)
+        i: Pose(
+            cam_R_map=band.rigs[i].b_R_a @ placed.poses[i].cam_R_map, map_C=placed.poses[i].map_C
+        )
         for i in of_photo
     }
+    # by both cameras: a lens takes up what that of the map's photo leaves out
+    name = {id(rig): f"{band.files.name} {n}" for n, rig in enumerate(band.rigs.values())}
+    camera_of = {i: name[id(band.rigs[i])] for i in poses}
     return Alignment(
         method="rig",
         why="its camera is beside that of the map's photos",
         frame=placed.frame,
         poses=poses,
-        cameras={band.files.name: band.rig.camera},
-        camera_of=dict.fromkeys(poses, band.files.name),
+        cameras={camera_of[i]: band.rigs[i].camera for i in poses},
+        camera_of=camera_of,
         blocks=(tuple(poses),),
         ties=no_ties(),
     )
@@ -186,20 +193,44 @@ class BandsDrawing:
         )
 
     def _views(self, band: PlacedBand) -> list[View]:
-        if band.rig is None:
+        if not band.rigs:
             return [v for v in self.ground.views if v.photo in band.of_photo]
         limits = replace(self.ground.limits, blanks={}, marks={})
         return make_views(aligned_band(band, self.placed), self.ground.surface, limits)
 
 
 def _whole(compose: Composer, window: Window) -> NDArray[np.float32]:
-    """A window (h, w, 1) of a band, with what the capture of the map does not show from others."""
+    """A window (h, w, 1) of a band, with what the capture of the map does not show, or shows
+    saturated, from others.
+    """
     composed = compose(window)
-    values, empty = composed.pixels, composed.photo < 0
+    values = np.asarray(composed.pixels, np.float32)
+    # beyond the cells that any photo covers there is nothing to be had
+    covered = np.repeat(np.repeat(composed.views > 0, STEP, 0), STEP, 1)
+    empty = np.isnan(values[..., 0])
+    empty &= covered[: empty.shape[0], : empty.shape[1]]
     if compose.labels is not None and empty.any():
-        more = replace(compose, labels=None)(window).pixels
-        values[empty] = more[empty]
-    return np.asarray(values, np.float32)
+        part = _around(empty)
+        more = replace(compose, labels=None)(
+            Window(
+                row=window.row + part[0].start,
+                column=window.column + part[1].start,
+                height=part[0].stop - part[0].start,
+                width=part[1].stop - part[1].start,
+            )
+        )
+        values[part][empty[part]] = more.pixels[empty[part]]
+    return values
+
+
+def _around(mask: NDArray[np.bool_]) -> tuple[slice, slice]:
+    """Rows and columns around what is true, by whole cells."""
+    first_last = [np.flatnonzero(mask.any(axis))[[0, -1]] for axis in (1, 0)]
+    rows, columns = (
+        slice(int(a) // STEP * STEP, min(int(b) // STEP * STEP + STEP, n))
+        for (a, b), n in zip(first_last, mask.shape, strict=True)
+    )
+    return rows, columns
 
 
 def _corner(block: Block) -> tuple[int, int]:

@@ -13,6 +13,7 @@ from skyquilt.coregistration.page import picture
 from skyquilt.model.photo import RejectedPhoto
 from skyquilt.multispectral.draw import BANDS_FILE, PlacedBand
 from skyquilt.multispectral.indices import INDICES, Index
+from skyquilt.multispectral.placing import Placing
 from skyquilt.raster.atomic import write_text
 from skyquilt.raster.colours import coloured
 from skyquilt.report.numbers import DASH, fixed, number, plain
@@ -45,7 +46,7 @@ _COMPOSITES = (
 
 def band_figures(
     bands: Sequence[PlacedBand],
-    refused: Mapping[str, str],
+    placed: Placing,
     lost: Sequence[RejectedPhoto],
     kind: str,
     indices: Sequence[str],
@@ -54,31 +55,39 @@ def band_figures(
     return {
         "values": kind,
         "shown": [_figures(b) for b in bands],
-        "refused": dict(refused),
+        "refused": placed.refused,
         "indices": list(indices),
         "photos_rejected": {p.name: p.reason for p in lost},
-        "notes": sorted({n for b in bands for c in b.files.converts for n in c.notes}),
+        "notes": [
+            *placed.notes[len(placed.refused) :],
+            *sorted({n for b in bands for c in b.files.converts for n in c.notes}),
+        ],
     }
 
 
 def _figures(band: PlacedBand) -> dict[str, Any]:
-    """Figures of one band; those of the camera are null where it is the map's own."""
-    rig, files = band.rig, band.files
+    """Figures of one band; those of the camera are null where it is the map's own. Of several
+    cameras, rotation and focal length are those of the first, the others those of the worst.
+    """
+    files, rigs = band.files, list(dict.fromkeys(band.rigs.values()))
     saved = {
         "name": files.name,
         "wavelength_nm": files.wavelength_nm,
         "unit": files.photos[0].unit,
         "photos": len(band.of_photo),
         "photos_total": len(files.photos),
+        "saturated": round(band.saturated, 4),
+        "cameras": max(len(rigs), 1),
     }
-    if rig is None:
+    if not rigs:
         return {**saved, "band_R_map_photo": None, "focal_px": None, "off_px": None, "agree": None}
+    off = max(r.off_px for r in rigs)
     return {
         **saved,
-        "band_R_map_photo": rig.b_R_a.tolist(),
-        "focal_px": round(rig.camera.focal, 2),
-        "off_px": round(rig.off_px, 3) if np.isfinite(rig.off_px) else None,
-        "agree": round(rig.share, 3),
+        "band_R_map_photo": rigs[0].b_R_a.tolist(),
+        "focal_px": round(rigs[0].camera.focal, 2),
+        "off_px": round(off, 3) if np.isfinite(off) else None,
+        "agree": round(min(r.share for r in rigs), 3),
     }
 
 

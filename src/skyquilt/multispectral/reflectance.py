@@ -58,6 +58,8 @@ class Reflectance:
     """By what the rest is multiplied, save for fall-off, gradient and irradiance."""
     saturated: float = math.inf
     """Counts from here on are no measurements."""
+    full: float = math.inf
+    """Counts that the range has."""
     vignetting: Vignetting | None = None
     """The fall-off of light."""
     gradient: float = 0.0
@@ -99,6 +101,7 @@ class Reflectance:
             black_level=black,
             scale=scale,
             saturated=2.0**bits - max(2.0 ** (bits - _SATURATED), 1.0),
+            full=2.0**bits,
             vignetting=vignetting,
             gradient=gradient,
             notes=tuple(notes),

@@ -1,0 +1,207 @@
+"""Where the files of each band were when they were taken: beside the map's photo of the same
+capture, by the camera of the band.
+
+Two drones have two rigs, so a camera is found for each two cameras whose files were taken together.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from skyquilt.engine.clock import Steps
+from skyquilt.engine.workers import Workers
+from skyquilt.imaging.grey import shrink, to_grey8
+from skyquilt.model.camera import Camera
+from skyquilt.model.photo import Photo, RejectedPhoto
+from skyquilt.model.registration import RefusedRegistration
+from skyquilt.multispectral.captures import (
+    THERMAL,
+    BandFiles,
+    bands_of_files,
+    captured_together,
+    tags_of,
+)
+from skyquilt.multispectral.draw import PlacedBand
+from skyquilt.multispectral.recorded import Recorded, look_at
+from skyquilt.multispectral.reflectance import KINDS, Kind
+from skyquilt.multispectral.rig import BandRig, FindBandRig, Together
+from skyquilt.photos.pixels import read_color
+from skyquilt.workflows.flow import AlignedPhotos, Scene
+
+MOST_PAIRS = 6
+"""Captures from which the camera of a band is found, distributed over the flight; each takes two
+thirds of a second.
+"""
+LONGEST = 1600
+"""Longest side in px of the pictures that are compared."""
+_FAR_PX = 1.0
+"""Distance of a band from the map, in px of its own, that is told."""
+_SATURATED = 0.02
+"""Share of saturated pixels that is told."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Placing:
+    """The bands of a flight that can be drawn, and what cannot be."""
+
+    bands: list[PlacedBand]
+    """By wavelength."""
+    kind: Kind
+    """What the values of all of them are, temperatures aside."""
+    refused: dict[str, str]
+    """The reason by the name of each band that is not drawn."""
+    lost: list[RejectedPhoto]
+    """Files of the other bands that are not drawn, though they were taken with one that is."""
+    notes: list[str]
+    """What the user is told."""
+
+
+def place_bands(scene: Scene, others: Sequence[Photo], workers: Workers) -> Steps[Placing]:
+    """The bands that can be drawn: those of the map's photos, if these show any, and of other
+    files.
+    """
+    aligned, poses = scene.aligned, scene.aligned.alignment.poses
+    own = bands_of_files([p for i, p in enumerate(aligned.photos) if i in poses and p.shows_a_band])
+    found = bands_of_files(others)
+    recorded = yield from _recorded([*own, *found], workers)
+    placed = [PlacedBand(files=b, of_photo=_own_files(aligned, b)) for b in own]
+    captures = [tags_of(p).capture for p in aligned.photos]
+    refused: dict[str, str] = {}
+    lost: list[RejectedPhoto] = []
+    for done, band in enumerate(found):
+        yield done, len(found), f"camera of {band.name}"
+        useless = {p.name: why for p in band.photos if (why := recorded[p.name].reason)}
+        lost += [RejectedPhoto(name=name, reason=why) for name, why in useless.items()]
+        band = band.only([j for j, p in enumerate(band.photos) if p.name not in useless])
+        of_photo = captured_together(aligned.photos, captures, band)
+        of_photo = {i: j for i, j in of_photo.items() if i in poses}
+        rigs = _rigs(aligned, band, of_photo)
+        known = {i: rig for i, rig in rigs.items() if isinstance(rig, BandRig)}
+        reasons = {i: rig.reason for i, rig in rigs.items() if not isinstance(rig, BandRig)}
+        if known:
+            lost += [
+                RejectedPhoto(name=band.photos[of_photo[i]].name, reason=why)
+                for i, why in reasons.items()
+            ]
+            of_photo = {i: of_photo[i] for i in known}
+            placed.append(PlacedBand(files=band, of_photo=of_photo, rigs=known))
+        else:
+            why = f"none of its files can be used: {next(iter(useless.values()), '')}"
+            refused[band.name] = next(iter(reasons.values()), why)
+    yield len(found), len(found), ""
+    placed = [replace(b, saturated=_saturated(b, recorded)) for b in placed]
+    placed.sort(key=lambda b: b.files.order)
+    bands, kind, weaker = _comparable(placed)
+    notes = [f"The band {name} is left out: {reason}." for name, reason in refused.items()]
+    notes += [note for b in placed for note in _notes(b)] + weaker
+    return Placing(bands=bands, kind=kind, refused=refused, lost=lost, notes=notes)
+
+
+def _recorded(bands: Sequence[BandFiles], workers: Workers) -> Steps[dict[str, Recorded]]:
+    """What each file recorded, by its name."""
+    items = [item for b in bands for item in zip(b.photos, b.converts, strict=True)]
+    found = {}
+    for (photo, _), looked in zip(items, workers.each(look_at, items), strict=True):
+        found[photo.name] = looked
+        yield len(found), len(items), photo.name
+    return found
+
+
+def _own_files(aligned: AlignedPhotos, band: BandFiles) -> dict[int, int]:
+    """Index of each of the map's photos -> that of the same file in a band of them."""
+    number = {p.name: j for j, p in enumerate(band.photos)}
+    return {i: number[p.name] for i, p in enumerate(aligned.photos) if p.name in number}
+
+
+def _rigs(
+    aligned: AlignedPhotos, band: BandFiles, of_photo: dict[int, int]
+) -> dict[int, BandRig | RefusedRegistration]:
+    """The camera of a band beside that of each of the map's photos (index)."""
+    alike: dict[tuple[str, str], dict[int, int]] = {}
+    for i, j in sorted(of_photo.items()):
+        cameras = aligned.photos[i].camera_key, band.photos[j].camera_key
+        alike.setdefault(cameras, {})[i] = j
+    if not alike:  # says that none were taken together
+        return {-1: _rig(aligned, band, {})}
+    return {i: rig for part in alike.values() for rig in [_rig(aligned, band, part)] for i in part}
+
+
+def _rig(
+    aligned: AlignedPhotos, band: BandFiles, of_photo: dict[int, int]
+) -> BandRig | RefusedRegistration:
+    """One camera of a band beside one of the map's photos."""
+    alignment, pairs = aligned.alignment, sorted(of_photo.items())
+    if any(alignment.poses[i].cam_H_map is not None for i, _ in pairs):
+        return RefusedRegistration(
+            reason="the map's photos have no adjusted poses; use --method bundle"
+        )
+    asked = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, MOST_PAIRS).astype(int))]
+    seen = [t for i, j in asked if (t := _together(aligned, i, band.photos[j])) is not None]
+    first = band.photos[pairs[0][1]] if pairs else None
+    camera = Camera.ideal(width=1, height=1, focal=1.0) if first is None else first.lens
+    sigma = 0.0 if first is None else first.focal.sigma_px / first.focal.px
+    return FindBandRig()(seen, camera, sigma)
+
+
+def _together(aligned: AlignedPhotos, index: int, other: Photo) -> Together | None:
+    """Pictures of one capture; None where the band's file cannot be read."""
+    try:
+        grey = to_grey8(read_color(other))
+    except Exception:  # whatever it is, it concerns this photo alone; told when it is drawn
+        return None
+    camera = aligned.alignment.camera(index)
+    return Together(a=aligned.grey(index, LONGEST), camera_a=camera, b=shrink(grey, LONGEST)[0])
+
+
+def _comparable(placed: Sequence[PlacedBand]) -> tuple[list[PlacedBand], Kind, list[str]]:
+    """The bands with values of the kind that all of them have, this kind, and a note where a few
+    files keep all others from a better one; temperatures stay.
+    """
+    light = [b for b in placed if b.files.name != THERMAL]
+    told = {
+        b.files.photos[j].name: b.files.converts[j].kind for b in light for j in b.of_photo.values()
+    }
+    kind: Kind = min(told.values(), key=KINDS.index, default="counts")
+    bands = [
+        b if b.files.name == THERMAL else replace(b, files=b.files.as_kind(kind)) for b in placed
+    ]
+    return bands, kind, _weaker(told, kind)
+
+
+def _weaker(told: dict[str, Kind], kind: Kind) -> list[str]:
+    """A note on the files (by name) whose values are of the kind of all, where most have a better
+    one.
+    """
+    those = [name for name, own in told.items() if own == kind]
+    if not those or 2 * len(those) >= len(told):
+        return []
+    usual = sorted(told.values(), key=KINDS.index)[len(told) // 2]
+    lacking = "irradiance" if kind in ("radiance", "by-band") else "exposure"
+    return [
+        f"{len(those)} of {len(told)} files tell no usable {lacking} ({those[0]} for one), so the"
+        f" values of all bands are {kind}, not {usual}: without these files they would be."
+    ]
+
+
+def _saturated(band: PlacedBand, recorded: dict[str, Recorded]) -> float:
+    """Share of saturated pixels in the files of a band that are drawn."""
+    shares = [recorded[band.files.photos[j].name].saturated for j in band.of_photo.values()]
+    return float(np.mean(shares)) if shares else 0.0
+
+
+def _notes(band: PlacedBand) -> list[str]:
+    """What is told of a band that is drawn."""
+    found, name = [], band.files.name
+    if band.saturated > _SATURATED:
+        found.append(
+            f"{band.saturated:.0%} of the pixels of the band {name} are saturated: they have no"
+            " value, and no index, unless another capture has one."
+        )
+    off = max((r.off_px for r in band.rigs.values()), default=0.0)
+    if off > _FAR_PX:
+        found.append(
+            f"The band {name} lies {off:.1f} px off the map's in the median: its indices are wrong"
+            " at edges."
+        )
+    return found

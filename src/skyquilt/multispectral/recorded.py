@@ -1,0 +1,55 @@
+"""What a file of a band recorded, before it is drawn: black, white and damaged files are left out.
+
+Such a file is placed beside the map's photo of its capture, whatever it shows, so nothing else
+would tell: a black file of the near infrared would make an NDVI of -1.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from skyquilt.model.photo import Photo
+from skyquilt.multispectral.reflectance import Reflectance
+from skyquilt.photos.pixels import lost, read_color
+from skyquilt.photos.read import rejected
+
+_EVERY = 4
+"""Rows and columns of which one is looked at."""
+_DARK = 0.001
+"""Share of the range up to which the median of a black file lies above its black level: noise of a
+detector of 12 bits, a few counts of whose 4096 is."""
+_BRIGHT = 0.004
+"""The same of all but the brightest hundredth of it: a night's street lamps are brighter."""
+_WHITE = 0.9
+"""Share of saturated pixels from which a file shows too little."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recorded:
+    """What one file recorded."""
+
+    reason: str = ""
+    """Why it is not drawn; empty where it is."""
+    saturated: float = 0.0
+    """Share of its pixels that are saturated."""
+
+
+def look_at(item: tuple[Photo, Reflectance]) -> Recorded:
+    """What a file recorded whose counts are converted so. Never raises."""
+    photo, convert = item
+    try:
+        pixels = read_color(photo)
+    except Exception as error:  # whatever it is, it concerns this file alone
+        return Recorded(reason=lost(photo) or rejected(photo.name, error).reason)
+    counts = np.asarray(pixels[::_EVERY, ::_EVERY], np.float32)
+    known = counts[np.isfinite(counts)]
+    if not known.size or known.min() == known.max():
+        return Recorded(reason="all its pixels have one value")
+    saturated = float((known >= convert.saturated).mean())
+    if saturated > _WHITE:
+        return Recorded(reason=f"{saturated:.0%} of its pixels are saturated")
+    if convert.kind != "counts":
+        median, bright = np.percentile(known, (50, 99)) - convert.black_level
+        if median < _DARK * convert.full and bright < _BRIGHT * convert.full:
+            return Recorded(reason="it is black: nothing in it is brighter than its black level")
+    return Recorded(saturated=saturated)
