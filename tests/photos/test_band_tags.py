@@ -95,7 +95,7 @@ def test_dji(path):
         ),
         irradiance=9741.75,
     )
-    assert photo.band_name == tags.name
+    assert photo.band_name == "red edge"
 
 
 def test_the_phantom_4_multispectral_writes_its_black_level_as_raw_pictures_do(path):

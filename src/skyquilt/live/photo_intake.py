@@ -16,6 +16,7 @@ from skyquilt.live.ledger import Ledger, hit
 from skyquilt.live.settings import LiveSettings
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.outside import open_regular, plain
+from skyquilt.photos.band_tags import canonical
 from skyquilt.photos.left_out import IS_MAP
 from skyquilt.photos.read import read_photo, rejected
 from skyquilt.video.srt import MOST_TELEMETRY_BYTES
@@ -200,7 +201,7 @@ class Intake:
         if not (photo.in_colours or photo.shows_a_band):
             return ""
         asked = self.settings.band
-        shown = self.ledger.meta("band") if asked is None else asked.lower()
+        shown = self.ledger.meta("band") if asked is None else canonical(asked.lower())
         if shown is None:
             shown = photo.band_name if photo.shows_a_band else ""
             self.ledger.put_meta("band", shown)

@@ -183,7 +183,9 @@ class Photo:
     (`matching.lens_kind`).
     """
     band_name: str = ""
-    """Band that a file of a multispectral camera shows, in lower case; empty for others."""
+    """Band that a file of a multispectral camera shows (`photos.band_tags.canonical`), in lower case;
+    empty for others.
+    """
     unusable_calibration: str = ""
     """A phrase on what its metadata give as a calibration and no lens can have; it is ignored."""
     focal: Focal

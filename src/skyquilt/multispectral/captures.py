@@ -17,7 +17,7 @@ from skyquilt.multispectral.reflectance import (
     smoothed_irradiance,
 )
 from skyquilt.photos.band_tags import BandTags, canonical, read_band_tags
-from skyquilt.photos.together import taken_together
+from skyquilt.photos.together import SECONDS, nearest_in_time, taken_together
 
 THERMAL = "lwir"
 """The band of temperatures, which says nothing of reflectance."""
@@ -135,9 +135,23 @@ def captured_together(
     for j, tags in enumerate(band.tags):
         if tags.capture in known:
             found.setdefault(known[tags.capture], j)
-    left_a = [i for i in range(len(photos)) if i not in found]
-    taken = set(found.values())
-    left_b = [j for j in range(len(band.photos)) if j not in taken]
-    pairs = taken_together([photos[i] for i in left_a], [band.photos[j] for j in left_b])
-    found |= {left_a[i]: left_b[j] for i, j in pairs}
+    for rule in (_at_once, taken_together, _same_second):
+        left_a = [i for i in range(len(photos)) if i not in found]
+        taken = set(found.values())
+        left_b = [j for j in range(len(band.photos)) if j not in taken]
+        pairs = rule([photos[i] for i in left_a], [band.photos[j] for j in left_b])
+        found |= {left_a[i]: left_b[j] for i, j in pairs}
     return found
+
+
+def _at_once(a: Sequence[Photo], b: Sequence[Photo]) -> list[tuple[int, int]]:
+    """Files of one time: the cameras of a rig have one clock, and numbers in names may be those of
+    another capture where files were lost.
+    """
+    return nearest_in_time(a, b, SECONDS)
+
+
+def _same_second(a: Sequence[Photo], b: Sequence[Photo]) -> list[tuple[int, int]]:
+    """Files less than a second apart, where the times of either camera are whole seconds."""
+    whole = [all(p.time is None or p.time.microsecond == 0 for p in photos) for photos in (a, b)]
+    return nearest_in_time(a, b, 1.0) if any(whole) else []

@@ -85,7 +85,7 @@ class BandTags:
     """What one file tells; None or empty where it tells nothing, or nothing that can be meant."""
 
     name: str = ""
-    """The band's name in lower case, as `Photo.band_name`."""
+    """The band's name as its file has it, in lower case."""
     wavelength_nm: float | None = None
     """Wavelength at its centre in nm."""
     width_nm: float | None = None
@@ -158,6 +158,14 @@ def band_tags(header: Header) -> BandTags:
         normalised=said.normalised(),
         notes=tuple(said.notes),
     )
+
+
+def band_shown(header: Header) -> str:
+    """The band that a file shows: `canonical` of its name, or of its wavelength where it has none;
+    empty where it tells neither.
+    """
+    name = tag.band_name(header.xmp)
+    return canonical(name, None if name else _Said(header).band()[0])
 
 
 def canonical(name: str, wavelength_nm: float | None = None) -> str:

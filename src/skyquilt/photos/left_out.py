@@ -16,6 +16,7 @@ from pathlib import Path, PurePosixPath
 from skyquilt.errors import UsageError
 from skyquilt.model.photo import Photo, RejectedPhoto, Survey
 from skyquilt.outside import plain
+from skyquilt.photos.band_tags import canonical
 from skyquilt.photos.side_rows import sentence_of
 
 SMALLER = 0.8
@@ -38,6 +39,7 @@ IS_PANORAMA = (
 )
 _FEW = 0.25
 """Share of the photos up to which pictures of that shape are exceptions."""
+NAMELESS = "it does not say which band of the camera it shows, as others of its kind do"
 PREFERRED = ("green", "red")
 """Bands that are shown before others of as many photos: lawns, fields and roads differ in them."""
 
@@ -219,13 +221,15 @@ def of_one_band(survey: Survey, wanted: str | None) -> Survey:
         UsageError: no file shows the band that is wanted.
     """
     bands = bands_of(survey.photos)
-    if wanted is not None and wanted.lower() not in bands:
+    wanted = None if wanted is None else canonical(wanted.lower())
+    if wanted is not None and wanted not in bands:
         there = f"they show {sentence_of(sorted(bands))}" if bands else "they name none"
         raise UsageError(f"no photo shows the band '{plain(wanted, 40)}' (--band): {there}")
     if not bands or (len(bands) < 2 and wanted is None and not _in_colours(survey.photos)):
         return survey
-    shown = wanted.lower() if wanted is not None else _usual(survey.photos)
-    out = {p.name: reason for p in survey.photos if (reason := p.other_band(shown))}
+    shown = wanted if wanted is not None else _usual(survey.photos)
+    out = _nameless(survey.photos)
+    out |= {p.name: reason for p in survey.photos if (reason := p.other_band(shown))}
     rejected = [RejectedPhoto(name=name, reason=reason) for name, reason in out.items()]
     return replace(
         survey,
@@ -247,6 +251,21 @@ def band_note(photos: Sequence[Photo]) -> tuple[str, ...]:
         f"Each file shows one band of a multispectral camera: {listed}. A map shows {which} --band"
         " names another; --all-bands draws all of them beside it.",
     )
+
+
+def _nameless(photos: Sequence[Photo]) -> dict[str, str]:
+    """A reason for each file that names no band, but looks like those of a camera that does: of the
+    same size and type, and fewer than of any band. Among files of one band it would be a patch of
+    another.
+    """
+    like = {(p.width, p.height, p.dtype) for p in photos if p.shows_a_band}
+    found = [
+        p.name
+        for p in photos
+        if p.channels == 1 and not (p.band_name or p.unit) and (p.width, p.height, p.dtype) in like
+    ]
+    few = len(found) < _AS_MANY * max(bands_of(photos).values(), default=0)
+    return dict.fromkeys(found, NAMELESS) if few else {}
 
 
 _AS_MANY = 0.5

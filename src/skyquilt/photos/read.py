@@ -16,6 +16,7 @@ from skyquilt.model.camera import Camera
 from skyquilt.model.photo import Focal, Photo, RejectedPhoto, Stored
 from skyquilt.outside import MOST_MP, check_picture, open_regular, plain, whole
 from skyquilt.photos import tags as tag
+from skyquilt.photos.band_tags import band_shown
 from skyquilt.photos.flir import MOST_THERMAL_MP
 from skyquilt.photos.headers import Header, content_digest, read_header
 from skyquilt.photos.lens import (
@@ -210,7 +211,7 @@ def _photo(path: Path, name: str, header: Header, thermal_unit: str | None) -> P
         stored=frame.stored if frame else "",
         camera_key=_camera_key(header, width, height),
         calibration=lens.calibration,
-        band_name=tag.band_name(header.xmp),
+        band_name=band_shown(header),
         unusable_calibration=" and ".join(lens.nonsense),
         focal=lens.focal,
         position=position,

@@ -49,6 +49,26 @@ def taken_together(a: Sequence[Photo], b: Sequence[Photo]) -> list[tuple[int, in
     return [(found[j], j) for j in sorted(found)]
 
 
+def nearest_in_time(a: Sequence[Photo], b: Sequence[Photo], most_s: float) -> list[tuple[int, int]]:
+    """Pairs (index of a, index of b) of photos of one clock, each of which is nearest in time to
+    the other, less than `most_s` seconds apart, and at one place. By ascending index of b.
+    """
+    if not (a and b):
+        return []
+    times = [
+        np.array([np.nan if p.time is None else p.time.replace(tzinfo=None).timestamp() for p in s])
+        for s in (a, b)
+    ]
+    gap = np.abs(times[0][:, None] - times[1][None, :])
+    gap[~(gap < most_s)] = np.inf
+    for i, j in np.argwhere(np.isfinite(gap)):
+        if not _possible(a[i], b[j]):
+            gap[i, j] = np.inf
+    first = gap.argmin(0)
+    pairs = [(int(i), j) for j, i in enumerate(first) if gap[i].argmin() == j]
+    return [(i, j) for i, j in pairs if np.isfinite(gap[i, j])]
+
+
 def _narrow(photo: Photo) -> float:
     """Focal length over the longer side: more for a narrower view."""
     return photo.focal.px / max(photo.width, photo.height)
