@@ -6,10 +6,13 @@ from datetime import datetime, timedelta
 import numpy as np
 import pytest
 
+from skyquilt.model.photo import GeoPosition
 from skyquilt.multispectral import captures
 from skyquilt.multispectral.captures import bands_of_files, captured_together
 from skyquilt.multispectral.indices import INDICES, indices_of
+from skyquilt.multispectral.placing import _weaker
 from skyquilt.photos.band_tags import BandTags
+from skyquilt.photos.together import SECONDS, nearest_in_time
 from tests.alignment.surveys import photo
 
 NOON = datetime(2024, 7, 15, 12)
@@ -88,3 +91,49 @@ def test_indices_are_normalised_differences():
     np.testing.assert_allclose(scaled[0, :2], found[0, :2], rtol=1e-6)
     assert indices_of(["blue", "green", "red"]) == ()
     assert indices_of(["green", "red", "red edge", "nir"]) == INDICES
+
+
+def numbered(photos, name, delay_s=0.0):
+    """Files of one camera in its own folder, numbered from 1, as if the second had been lost."""
+    kept = [p for k, p in enumerate(photos) if name != "nir" or k != 1]
+    return [
+        replace(p, name=f"{name}/IMG_{k + 1:04d}.tif", time=p.time + timedelta(seconds=delay_s))
+        for k, p in enumerate(kept)
+    ]
+
+
+def test_numbers_in_names_do_not_outweigh_times(files):
+    photos, told = files
+    green, _, nir = bands_of_files(photos)
+    a = numbered(green.photos, "green")
+    b = replace(nir, photos=tuple(numbered(nir.photos, "nir", 0.1)))
+    b = replace(b, tags=tuple(replace(TOLD, name="nir") for _ in b.photos))
+    assert captured_together(a, [""] * 5, b) == {0: 0, 2: 1, 3: 2, 4: 3}
+
+
+def test_times_in_whole_seconds_are_less_than_a_second_off(files):
+    photos, told = files
+    told |= {name: replace(t, capture="") for name, t in told.items()}
+    *_, nir = bands_of_files(photos)
+    colours = [
+        replace(p, name=f"{9 - k}.jpg", time=p.time + timedelta(seconds=0.2 * k + 0.15))
+        for k, p in enumerate(nir.photos)
+    ]
+    assert captured_together(colours, [""] * 5, nir) == {k: k for k in range(5)}
+    assert nearest_in_time(colours, nir.photos, SECONDS) == [(k, k) for k in range(3)]
+
+
+def test_files_of_two_drones_are_not_mixed():
+    """Two drones that take photos at once, which tell no captures."""
+    here = GeoPosition(latitude_deg=50.8, longitude_deg=-0.14, altitude_m=60.0, datum="takeoff")
+    there = replace(here, latitude_deg=50.801)
+    a = [replace(photo("1.tif"), time=NOON, position=p) for p in (here, there)]
+    assert nearest_in_time(a, a[::-1], SECONDS) == [(1, 0), (0, 1)]
+
+
+def test_a_note_tells_which_files_make_all_values_weaker():
+    told = dict.fromkeys([f"{k}.tif" for k in range(9)], "relative") | {"bad.tif": "radiance"}
+    (note,) = _weaker(told, "radiance")
+    assert "1 of 10 files tell no usable irradiance (bad.tif" in note
+    assert _weaker(dict.fromkeys(told, "radiance"), "radiance") == []
+    assert _weaker(dict.fromkeys(told, "relative"), "relative") == []

@@ -262,3 +262,19 @@ def test_any_values(make_jpeg, data):
     numbers = [v for f in fields(tags) if isinstance(v := getattr(tags, f.name), float)]
     assert np.isfinite(numbers).all()
     assert all(note.isprintable() for note in tags.notes)
+
+
+@pytest.mark.parametrize(
+    ("name", "wavelength", "shown"),
+    [
+        ("RedEdge", "730", "red edge"),
+        ("Red edge", "717", "red edge"),
+        (None, "842", "nir"),
+        ("Red-650", "650", "red-650"),  # the second red of ten bands
+        (None, None, ""),
+    ],
+)
+def test_bands_have_one_name_however_they_are_told(tmp_path, name, wavelength, shown):
+    told = {"Camera__BandName": name, "Camera__CentralWavelength": wavelength}
+    path = micasense(tmp_path / "a.tif", np.zeros((60, 80), np.uint16), **told)
+    assert read_photo(path).band_name == shown

@@ -6,7 +6,7 @@ import pytest
 
 from skyquilt.errors import UsageError
 from skyquilt.model.photo import Survey
-from skyquilt.photos.left_out import band_note, of_one_band
+from skyquilt.photos.left_out import NAMELESS, band_note, of_one_band
 from skyquilt.photos.read import read_photo
 from tests.alignment.surveys import photo
 
@@ -43,6 +43,21 @@ def test_files_of_one_channel_without_a_band_stay():
     assert [p.band_name for p in kept.photos] == ["green"] * 3 + [""] * 3
     plain = survey(*grey)
     assert of_one_band(plain, None) is plain and band_note(grey) == ()
+
+
+def test_a_few_files_without_a_band_are_left_out():
+    """A file in a hundred has lost its XMP: among those of one band it would show another."""
+    grey = replace(band("", 1), name="1_lost.tif")
+    other = replace(band("", 2), name="2_other.tif", width=333)  # of another camera
+    kept = of_one_band(survey(*FIVE.photos, grey, other), None)
+    assert [p.band_name for p in kept.photos] == ["green"] * 3 + [""]
+    assert {p.name: p.reason for p in kept.rejected}["1_lost.tif"] == NAMELESS
+    assert "1_lost.tif" not in {p.name for p in kept.other_bands}
+
+
+@pytest.mark.parametrize(("wanted", "told"), [("RedEdge", "red edge"), ("re", "red edge")])
+def test_a_band_can_be_asked_for_as_its_maker_spells_it(wanted, told):
+    assert {p.band_name for p in of_one_band(FIVE, wanted).photos} == {told}
 
 
 @pytest.mark.parametrize(("number", "wanted"), [(3, None), (3, "nir"), (1, None)])

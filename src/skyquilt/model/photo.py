@@ -183,7 +183,7 @@ class Photo:
     (`matching.lens_kind`).
     """
     band_name: str = ""
-    """Band that a file of a multispectral camera shows (`photos.band_tags.canonical`), in lower case;
+    """Band that a file of a multispectral camera shows, in lower case (`band_tags.canonical`);
     empty for others.
     """
     unusable_calibration: str = ""
