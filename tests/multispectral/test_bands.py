@@ -9,6 +9,7 @@ import pytest
 from skyquilt.model.photo import GeoPosition
 from skyquilt.multispectral import captures
 from skyquilt.multispectral.captures import bands_of_files, captured_together
+from skyquilt.multispectral.draw import averaged
 from skyquilt.multispectral.indices import INDICES, indices_of
 from skyquilt.multispectral.placing import _weaker
 from skyquilt.photos.band_tags import BandTags
@@ -137,3 +138,15 @@ def test_a_note_tells_which_files_make_all_values_weaker():
     assert "1 of 10 files tell no usable irradiance (bad.tif" in note
     assert _weaker(dict.fromkeys(told, "radiance"), "radiance") == []
     assert _weaker(dict.fromkeys(told, "relative"), "relative") == []
+
+
+def test_values_are_means_where_the_map_is_coarser():
+    """Every other pixel of a fine pattern would show one of its two values."""
+    rows, columns = np.mgrid[0:60, 0:80]
+    values = np.where((rows + columns) % 2, 0.8, 0.2).astype(np.float32)
+    values[:, 60:] = np.nan  # saturated
+    values[20, 20] = np.nan
+    found = averaged(values, 5.0)
+    np.testing.assert_allclose(found[4:56, 4:56], 0.5, atol=0.03)
+    assert np.isnan(found[:, 63:]).all() and np.isfinite(found[:, :60]).all()
+    assert averaged(values, 1.4) is values

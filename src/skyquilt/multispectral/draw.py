@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,7 +21,7 @@ from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.workers import Workers
 from skyquilt.errors import PhotoFailedError
 from skyquilt.imaging.nodes import STEP, View
-from skyquilt.imaging.views import make_views
+from skyquilt.imaging.views import make_views, native_gsd
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, Pose, no_ties
 from skyquilt.model.raster import Window
@@ -38,6 +39,9 @@ from skyquilt.photos.read import rejected
 from skyquilt.raster import Block, CogWriter, RasterSpec
 
 BANDS_FILE = "bands.tif"
+_LARGER = 2.0
+"""Pixels of a file to a pixel of the map from which values are means: between fewer of them they
+are interpolated."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -174,15 +178,19 @@ class BandsDrawing:
 
     def _composer(self, band: PlacedBand) -> Composer:
         photos, of_photo, converts = band.files.photos, band.of_photo, band.files.converts
+        views = self._views(band)
+        size = self.ground.grid.gsd / native_gsd(views, self.ground.surface) if views else 1.0
 
         def read(i: int) -> NDArray[Any]:
             values = _pixels(photos[of_photo[i]])
-            return values if photos[of_photo[i]].unit else converts[of_photo[i]](values)
+            if not photos[of_photo[i]].unit:
+                values = converts[of_photo[i]](values)
+            return averaged(values, size)
 
         share = self.pixels_bytes // len(self.bands)
         return Composer(
             grid=self.ground.grid,
-            views=self._views(band),
+            views=views,
             surface=self.ground.surface,
             blend=self.blend,
             pixels=PixelCache(read=read, budget_bytes=share),
@@ -231,6 +239,20 @@ def _around(mask: NDArray[np.bool_]) -> tuple[slice, slice]:
         for (a, b), n in zip(first_last, mask.shape, strict=True)
     )
     return rows, columns
+
+
+def averaged(values: NDArray[Any], size: float) -> NDArray[Any]:
+    """Values (h, w) as means over squares of so many px, where a pixel of the map is larger than
+    one of the file: a panchromatic band beside others, or a map that is asked for coarser than
+    photos. A mean of measurements; NaN where most of the square has none.
+    """
+    if size < _LARGER:
+        return values
+    across = 2 * round((size - 1) / 2) + 1
+    known = np.isfinite(values)
+    mean = cv2.blur(np.where(known, values, 0).astype(np.float32), (across, across))
+    share = cv2.blur(known.astype(np.float32), (across, across))
+    return np.where(share > 0.5, mean / np.maximum(share, 0.5), np.float32(np.nan))
 
 
 def _corner(block: Block) -> tuple[int, int]:
