@@ -161,6 +161,32 @@ def test_a_lost_file_and_a_band_of_other_ground_are_left_out(bare, tmp_path, mon
     assert "SIM_0005_MS_NIR.TIF is left out: its file is gone" in texts
 
 
+def test_two_drones_and_black_files(flown, bare, tmp_path):
+    """Files of the last captures say that another camera took them; two files are black. Values
+    stay those of the truth.
+    """
+    shutil.copytree(bare, tmp_path / "photos")
+    for path in sorted((tmp_path / "photos").iterdir()):
+        raw = path.read_bytes()
+        if path.name >= "SIM_0006":
+            assert raw.count(b"MSP001") == 1
+            raw = raw.replace(b"MSP001", b"MSP002")
+        if path.name in ("SIM_0003_MS_NIR.TIF", "SIM_0007_MS_R.TIF"):
+            raw = raw[: -2 * 480 * 360] + np.full(480 * 360, 3200, np.uint16).tobytes()
+        path.write_bytes(raw)
+    *before, last = iter_bands(tmp_path / "photos", tmp_path / "out", SETTINGS)
+    told = last.metrics["bands"]
+    assert told["refused"] == {}
+    assert [b["photos"] for b in told["shown"]] == [9, 9, 8, 9, 8]
+    assert [b["cameras"] for b in told["shown"]] == [2, 1, 2, 2, 2]
+    assert sorted(told["photos_rejected"]) == ["SIM_0003_MS_NIR.TIF", "SIM_0007_MS_R.TIF"]
+    texts = [e.text for e in before if isinstance(e, Note)]
+    assert "SIM_0003_MS_NIR.TIF is left out: all its pixels have one value" in texts
+    judgement = judged(tmp_path / "out", flown)
+    assert judgement["beside green, median"] < 0.25 and judgement["factors differ by"] < 0.04
+    assert judgement["NDVI off, median"] < 0.02
+
+
 def test_photos_without_bands_are_refused(flown, tmp_path):
     with pytest.raises(UsageError, match="--all-bands needs files that each show one band"):
         list(iter_bands(flown / "photos", tmp_path / "out", SETTINGS))

@@ -39,9 +39,8 @@ from skyquilt.photos.read import rejected
 from skyquilt.raster import Block, CogWriter, RasterSpec
 
 BANDS_FILE = "bands.tif"
-_LARGER = 2.0
-"""Pixels of a file to a pixel of the map from which values are means: between fewer of them they
-are interpolated."""
+_LARGER = 1.5
+"""Pixels of a file along one of the map from which values are means of several."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -242,16 +241,16 @@ def _around(mask: NDArray[np.bool_]) -> tuple[slice, slice]:
 
 
 def averaged(values: NDArray[Any], size: float) -> NDArray[Any]:
-    """Values (h, w) as means over squares of so many px, where a pixel of the map is larger than
+    """Values (h, w) as means over about so many px across, where a pixel of the map is larger than
     one of the file: a panchromatic band beside others, or a map that is asked for coarser than
-    photos. A mean of measurements; NaN where most of the square has none.
+    photos. A mean of measurements; NaN where most of them are none.
     """
     if size < _LARGER:
         return values
-    across = 2 * round((size - 1) / 2) + 1
+    sigma = float(np.sqrt((size**2 - 1) / 12))  # what a square of so many px adds to one
     known = np.isfinite(values)
-    mean = cv2.blur(np.where(known, values, 0).astype(np.float32), (across, across))
-    share = cv2.blur(known.astype(np.float32), (across, across))
+    mean = cv2.GaussianBlur(np.where(known, values, 0).astype(np.float32), (0, 0), sigma)
+    share = cv2.GaussianBlur(known.astype(np.float32), (0, 0), sigma)
     return np.where(share > 0.5, mean / np.maximum(share, 0.5), np.float32(np.nan))
 
 

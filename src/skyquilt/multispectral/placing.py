@@ -177,10 +177,11 @@ def _weaker(told: dict[str, Kind], kind: Kind) -> list[str]:
     if not those or 2 * len(those) >= len(told):
         return []
     usual = sorted(told.values(), key=KINDS.index)[len(told) // 2]
-    lacking = "irradiance" if kind in ("radiance", "by-band") else "exposure"
+    lacking = "irradiance" if kind == "radiance" else "calibration"
     return [
-        f"{len(those)} of {len(told)} files tell no usable {lacking} ({those[0]} for one), so the"
-        f" values of all bands are {kind}, not {usual}: without these files they would be."
+        f"{len(those)} of {len(told)} files tell no usable {lacking} ({those[0]} for one), so that"
+        f" the values of all bands are of the kind '{kind}'; without these files they would be"
+        f" '{usual}'."
     ]
 
 

@@ -343,7 +343,7 @@ def _camera_key(header: Header, width: int, height: int) -> str:
         model,
         exif.text(tag.SERIAL) or xmp.text("CameraSerialNumber", "drone-dji:DroneSerialNumber"),
         exif.text(tag.LENS),
-        xmp.text("Camera:BandName", "drone-dji:BandName"),
+        band_shown(header),
         f"{width}x{height}",
         f"{mm:.1f}mm" if mm else "",
         f"zoom {zoom:g}" if zoom > 1 else "",
