@@ -26,9 +26,9 @@ from rasterio.warp import Resampling, reproject
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks.cost import machine
 
+from skyquilt.model.bands import canonical
 from skyquilt.model.event import StageFinished
 from skyquilt.multispectral.workflow import iter_bands
-from skyquilt.photos.band_tags import canonical
 from skyquilt.settings import MosaicSettings
 from skyquilt.simulate import FlightSettings, simulate
 from skyquilt.simulate.settings import Multispectral, Reporting, Route

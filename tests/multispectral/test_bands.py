@@ -2,16 +2,18 @@
 
 from dataclasses import replace
 from datetime import datetime, timedelta
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from skyquilt.model.photo import GeoPosition
+from skyquilt.model.poses import Pose
 from skyquilt.multispectral import captures
 from skyquilt.multispectral.captures import bands_of_files, captured_together
 from skyquilt.multispectral.draw import averaged
 from skyquilt.multispectral.indices import INDICES, indices_of
-from skyquilt.multispectral.placing import _weaker
+from skyquilt.multispectral.placing import _far, _weaker
 from skyquilt.photos.band_tags import BandTags
 from skyquilt.photos.together import SECONDS, nearest_in_time
 from tests.alignment.surveys import photo
@@ -152,3 +154,19 @@ def test_values_are_means_where_the_map_is_coarser():
         np.testing.assert_allclose(found[known], 0.5, atol=most)
         assert not known[:, 63:].any() and known[:, :58].sum() >= 60 * 58 - 1
     assert averaged(values, 1.4) is values
+
+
+def test_captures_on_the_way_up_do_not_tell_the_camera():
+    heights = [3.0, 12.0, 30.0, 60.0, 62.0, 58.0, 61.0, 20.0]
+    poses = {
+        i: Pose(cam_R_map=np.diag([1.0, -1.0, -1.0]), map_C=np.array([5.0 * i, 0.0, 200.0 + h]))
+        for i, h in enumerate(heights)
+    }
+    surface = SimpleNamespace(at=lambda x, y: np.full(np.shape(x), 200.0))
+    scene = SimpleNamespace(
+        aligned=SimpleNamespace(alignment=SimpleNamespace(poses=poses)),
+        ground=SimpleNamespace(surface=surface),
+    )
+    pairs = [(i, i) for i in poses]
+    assert _far(scene, pairs) == [(i, i) for i in (2, 3, 4, 5, 6)]
+    assert _far(scene, []) == []

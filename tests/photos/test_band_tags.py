@@ -8,7 +8,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from skyquilt.errors import UnreadablePhotoError
-from skyquilt.photos.band_tags import BandTags, Vignetting, canonical, read_band_tags
+from skyquilt.model.bands import canonical
+from skyquilt.photos.band_tags import BandTags, Vignetting, read_band_tags
 from skyquilt.photos.read import read_photo
 
 from .band_files import DJI, MICASENSE, SEQUOIA, dji, micasense, packet, reading, sequoia

@@ -14,9 +14,9 @@ from skyquilt.live.failures import of_the_system
 from skyquilt.live.inbox import Arrived, Inbox, belongs_to_clip, gone, is_clip
 from skyquilt.live.ledger import Ledger, hit
 from skyquilt.live.settings import LiveSettings
+from skyquilt.model.bands import canonical
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.outside import open_regular, plain
-from skyquilt.photos.band_tags import canonical
 from skyquilt.photos.left_out import IS_MAP
 from skyquilt.photos.read import read_photo, rejected
 from skyquilt.video.srt import MOST_TELEMETRY_BYTES

@@ -183,7 +183,7 @@ class Photo:
     (`matching.lens_kind`).
     """
     band_name: str = ""
-    """Band that a file of a multispectral camera shows, in lower case (`band_tags.canonical`);
+    """Band that a file of a multispectral camera shows, in lower case (`bands.canonical`);
     empty for others.
     """
     unusable_calibration: str = ""

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.errors import UnreadablePhotoError
+from skyquilt.model.bands import canonical
 from skyquilt.model.photo import Photo
 from skyquilt.multispectral.reflectance import (
     KINDS,
@@ -16,7 +17,7 @@ from skyquilt.multispectral.reflectance import (
     common_kind,
     smoothed_irradiance,
 )
-from skyquilt.photos.band_tags import BandTags, canonical, read_band_tags
+from skyquilt.photos.band_tags import BandTags, read_band_tags
 from skyquilt.photos.together import SECONDS, nearest_in_time, taken_together
 
 THERMAL = "lwir"
@@ -28,7 +29,7 @@ class BandFiles:
     """The files of one band."""
 
     name: str
-    """Its name, one of `photos.band_tags.canonical` where it is known."""
+    """Its name, one of `model.bands.canonical` where it is known."""
     photos: tuple[Photo, ...]
     """Its files."""
     tags: tuple[BandTags, ...]

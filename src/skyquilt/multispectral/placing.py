@@ -35,6 +35,8 @@ thirds of a second.
 """
 LONGEST = 1600
 """Longest side in px of the pictures that are compared."""
+_FAR = 0.6
+"""Share of the usual height above the ground from which a capture can tell the camera."""
 _FAR_PX = 1.0
 """Distance of a band from the map, in px of its own, that is told."""
 _SATURATED = 0.02
@@ -76,7 +78,7 @@ def place_bands(scene: Scene, others: Sequence[Photo], workers: Workers) -> Step
         band = band.only([j for j, p in enumerate(band.photos) if p.name not in useless])
         of_photo = captured_together(aligned.photos, captures, band)
         of_photo = {i: j for i, j in of_photo.items() if i in poses}
-        rigs = _rigs(aligned, band, of_photo)
+        rigs = _rigs(scene, band, of_photo)
         known = {i: rig for i, rig in rigs.items() if isinstance(rig, BandRig)}
         reasons = {i: rig.reason for i, rig in rigs.items() if not isinstance(rig, BandRig)}
         if known:
@@ -115,33 +117,46 @@ def _own_files(aligned: AlignedPhotos, band: BandFiles) -> dict[int, int]:
 
 
 def _rigs(
-    aligned: AlignedPhotos, band: BandFiles, of_photo: dict[int, int]
+    scene: Scene, band: BandFiles, of_photo: dict[int, int]
 ) -> dict[int, BandRig | RefusedRegistration]:
     """The camera of a band beside that of each of the map's photos (index)."""
+    aligned = scene.aligned
     alike: dict[tuple[str, str], dict[int, int]] = {}
     for i, j in sorted(of_photo.items()):
         cameras = aligned.photos[i].camera_key, band.photos[j].camera_key
         alike.setdefault(cameras, {})[i] = j
     if not alike:  # says that none were taken together
-        return {-1: _rig(aligned, band, {})}
-    return {i: rig for part in alike.values() for rig in [_rig(aligned, band, part)] for i in part}
+        return {-1: _rig(scene, band, {})}
+    return {i: rig for part in alike.values() for rig in [_rig(scene, band, part)] for i in part}
 
 
-def _rig(
-    aligned: AlignedPhotos, band: BandFiles, of_photo: dict[int, int]
-) -> BandRig | RefusedRegistration:
+def _rig(scene: Scene, band: BandFiles, of_photo: dict[int, int]) -> BandRig | RefusedRegistration:
     """One camera of a band beside one of the map's photos."""
-    alignment, pairs = aligned.alignment, sorted(of_photo.items())
+    aligned, pairs = scene.aligned, sorted(of_photo.items())
+    alignment = aligned.alignment
     if any(alignment.poses[i].cam_H_map is not None for i, _ in pairs):
         return RefusedRegistration(
             reason="the map's photos have no adjusted poses; use --method bundle"
         )
+    pairs = _far(scene, pairs)
     asked = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, MOST_PAIRS).astype(int))]
     seen = [t for i, j in asked if (t := _together(aligned, i, band.photos[j])) is not None]
     first = band.photos[pairs[0][1]] if pairs else None
     camera = Camera.ideal(width=1, height=1, focal=1.0) if first is None else first.lens
     sigma = 0.0 if first is None else first.focal.sigma_px / first.focal.px
     return FindBandRig()(seen, camera, sigma)
+
+
+def _far(scene: Scene, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """The pairs without those taken on the way up or down: the few centimetres between cameras are
+    many pixels of near ground.
+    """
+    if not pairs:
+        return []
+    C = np.array([scene.aligned.alignment.poses[i].map_C for i, _ in pairs])
+    heights = C[:, 2] - scene.ground.surface.at(C[:, 0], C[:, 1])
+    far = heights > _FAR * np.median(heights)
+    return [pair for pair, used in zip(pairs, far, strict=True) if used]
 
 
 def _together(aligned: AlignedPhotos, index: int, other: Photo) -> Together | None:

@@ -8,7 +8,8 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from skyquilt.photos.band_tags import SUN, BandTags, Vignetting, canonical
+from skyquilt.model.bands import canonical
+from skyquilt.photos.band_tags import SUN, BandTags, Vignetting
 
 Kind = Literal["counts", "radiance", "by-band", "relative", "reflectance"]
 """What values are, the weakest first: as recorded; proportional to the light that came from the

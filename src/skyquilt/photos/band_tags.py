@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
+from skyquilt.model.bands import canonical
 from skyquilt.outside import MOST_MP, plain, real, whole
 from skyquilt.photos import tags as tag
 from skyquilt.photos.headers import Header, read_header
@@ -43,25 +44,6 @@ _FULL = 65535
 _USUAL_GAIN = 1
 _BAND = re.compile(r"(\d{2,5}(?:\.\d{1,6})?)\s?(?:\(\s?)?(?:\+/-|\+-|±)\s?(\d{1,4}(?:\.\d{1,6})?)")
 """DJI's `BandFreq`, such as `560(+/-16)nm`."""
-_NAMES = {
-    "blue": ("blue",),
-    "green": ("green", "gre"),
-    "red": ("red",),
-    "red edge": ("rededge", "edge", "re", "reg"),
-    "nir": ("nir", "nearinfrared", "nearir"),
-    "panchro": ("panchro", "panchromatic", "pan"),
-    "lwir": ("lwir", "thermal", "thermalinfrared"),
-}
-_SPELLINGS = {spelling: name for name, spellings in _NAMES.items() for spelling in spellings}
-_RANGES = {
-    "blue": (430.0, 510.0),
-    "green": (520.0, 590.0),
-    "red": (610.0, 690.0),
-    "red edge": (695.0, 760.0),
-    "nir": (770.0, 1000.0),
-    "lwir": (7000.0, 15_000.0),
-}
-"""Wavelengths in nm at the centre of bands that have no name."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,26 +140,6 @@ def band_tags(header: Header) -> BandTags:
         normalised=said.normalised(),
         notes=tuple(said.notes),
     )
-
-
-def band_shown(header: Header) -> str:
-    """The band that a file shows: `canonical` of its name, or of its wavelength where it has none;
-    empty where it tells neither.
-    """
-    name = tag.band_name(header.xmp)
-    return canonical(name, None if name else _Said(header).band()[0])
-
-
-def canonical(name: str, wavelength_nm: float | None = None) -> str:
-    """One of blue, green, red, red edge, nir, panchro and lwir, however a maker spells it, and from
-    the wavelength where there is no name; else the name (a camera's second blue is `blue-444`).
-    """
-    spelling = re.sub(r"[^a-z0-9]", "", name.lower())
-    if found := _SPELLINGS.get(spelling):
-        return found
-    if name.strip() or wavelength_nm is None:
-        return name
-    return next((n for n, (a, b) in _RANGES.items() if a <= wavelength_nm <= b), name)
 
 
 class _Said:

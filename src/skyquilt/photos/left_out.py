@@ -14,9 +14,9 @@ from itertools import product
 from pathlib import Path, PurePosixPath
 
 from skyquilt.errors import UsageError
+from skyquilt.model.bands import canonical
 from skyquilt.model.photo import Photo, RejectedPhoto, Survey
 from skyquilt.outside import plain
-from skyquilt.photos.band_tags import canonical
 from skyquilt.photos.side_rows import sentence_of
 
 SMALLER = 0.8

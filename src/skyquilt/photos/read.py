@@ -16,7 +16,6 @@ from skyquilt.model.camera import Camera
 from skyquilt.model.photo import Focal, Photo, RejectedPhoto, Stored
 from skyquilt.outside import MOST_MP, check_picture, open_regular, plain, whole
 from skyquilt.photos import tags as tag
-from skyquilt.photos.band_tags import band_shown
 from skyquilt.photos.flir import MOST_THERMAL_MP
 from skyquilt.photos.headers import Header, content_digest, read_header
 from skyquilt.photos.lens import (
@@ -211,7 +210,7 @@ def _photo(path: Path, name: str, header: Header, thermal_unit: str | None) -> P
         stored=frame.stored if frame else "",
         camera_key=_camera_key(header, width, height),
         calibration=lens.calibration,
-        band_name=band_shown(header),
+        band_name=tag.band_shown(header.xmp),
         unusable_calibration=" and ".join(lens.nonsense),
         focal=lens.focal,
         position=position,
@@ -343,7 +342,7 @@ def _camera_key(header: Header, width: int, height: int) -> str:
         model,
         exif.text(tag.SERIAL) or xmp.text("CameraSerialNumber", "drone-dji:DroneSerialNumber"),
         exif.text(tag.LENS),
-        band_shown(header),
+        tag.band_shown(header.xmp),
         f"{width}x{height}",
         f"{mm:.1f}mm" if mm else "",
         f"zoom {zoom:g}" if zoom > 1 else "",

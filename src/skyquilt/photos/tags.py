@@ -12,6 +12,7 @@ from typing import Any, BinaryIO
 
 from defusedxml import ElementTree
 
+from skyquilt.model.bands import canonical
 from skyquilt.outside import plain, real
 
 EXIF_IFD, GPS_IFD = 0x8769, 0x8825
@@ -258,6 +259,14 @@ class Xmp:
 def band_name(xmp: Xmp) -> str:
     """The name of the band that a file shows, in lower case; empty where it tells none."""
     return plain(" ".join(xmp.text("Camera:BandName", "BandName").lower().split()), 40)
+
+
+def band_shown(xmp: Xmp) -> str:
+    """The band that a file shows: `canonical` of its name, or of its wavelength where it has none;
+    empty where it tells neither.
+    """
+    name = band_name(xmp)
+    return canonical(name, None if name else xmp.number("CentralWavelength"))
 
 
 def parse_number(text: str) -> float | None:
