@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from datetime import datetime, timedelta
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,11 +12,12 @@ from skyquilt.model.photo import GeoPosition
 from skyquilt.model.poses import Pose
 from skyquilt.multispectral import captures
 from skyquilt.multispectral.captures import bands_of_files, captured_together
-from skyquilt.multispectral.draw import averaged
+from skyquilt.multispectral.draw import BandsDrawing, averaged
 from skyquilt.multispectral.indices import INDICES, indices_of
 from skyquilt.multispectral.placing import _far, _weaker
 from skyquilt.photos.band_tags import BandTags
 from skyquilt.photos.together import SECONDS, nearest_in_time
+from skyquilt.raster import Block
 from tests.alignment.surveys import photo
 
 NOON = datetime(2024, 7, 15, 12)
@@ -170,3 +172,30 @@ def test_captures_on_the_way_up_do_not_tell_the_camera():
     pairs = [(i, i) for i in poses]
     assert _far(scene, pairs) == [(i, i) for i in (2, 3, 4, 5, 6)]
     assert _far(scene, []) == []
+
+
+def test_few_blocks_of_many_bands_are_in_memory():
+    """However many threads there are, a block of ten bands is forty bytes per pixel."""
+    drawing = BandsDrawing(
+        output=Path(),
+        bands=[None] * 8,
+        indices=INDICES[:2],
+        ground=None,
+        placed=None,
+        labels=None,
+        blend=None,
+        boundary=None,
+        pixels_bytes=4 * 2 * 40 * 64 * 64,
+        key="",
+        tags={},
+    )
+    asked = []
+
+    def each(work, items):
+        asked.append(len(items))
+        return map(work, items)
+
+    todo = [Block(row0=0, col0=64 * k, height=64, width=64) for k in range(10)]
+    found = drawing._few_at_a_time(lambda b: b.col0, todo, SimpleNamespace(each=each))
+    assert list(found) == [64 * k for k in range(10)]
+    assert asked == [4, 4, 2]

@@ -131,11 +131,27 @@ class BandsDrawing:
             ]
             left = [{_corner(b) for b in writer.blocks()} for writer in (main, *others)]
             todo = [b for b in _all(main, others) if any(_corner(b) in some for some in left)]
-            for done, (block, pixels) in enumerate(zip(todo, workers.each(one, todo), strict=True)):
+            drawn = self._few_at_a_time(one, todo, workers)
+            for done, (block, pixels) in enumerate(zip(todo, drawn, strict=True)):
                 for writer, some, values in zip((main, *others), left, pixels, strict=True):
                     if _corner(block) in some:
                         writer.write_block(block, values, np.asarray(np.isfinite(values).any(2)))
                 yield done + 1, len(todo)
+
+    def _few_at_a_time(
+        self,
+        one: Callable[[Block], list[NDArray[np.float32]]],
+        todo: Sequence[Block],
+        workers: Workers,
+    ) -> Iterator[list[NDArray[np.float32]]]:
+        """The blocks of all rasters, of which no more are in memory than half of what photos may
+        take: workers keep several each, and all bands of a block are many times one of a picture.
+        """
+        values = len(self.bands) + len(self.indices)
+        largest = max((b.height * b.width * values * 4 for b in todo), default=1)
+        number = max(1, self.pixels_bytes // 2 // largest)
+        for k in range(0, len(todo), number):
+            yield from workers.each(one, todo[k : k + number])
 
     def _writer(self, name: str, spec: RasterSpec) -> CogWriter:
         spool = self.output / STATE / f"{name}.spool"
@@ -186,7 +202,7 @@ class BandsDrawing:
                 values = converts[of_photo[i]](values)
             return averaged(values, size)
 
-        share = self.pixels_bytes // len(self.bands)
+        share = self.pixels_bytes // 2 // len(self.bands)
         return Composer(
             grid=self.ground.grid,
             views=views,
