@@ -195,7 +195,7 @@ def test_few_blocks_of_many_bands_are_in_memory():
         asked.append(len(items))
         return map(work, items)
 
-    todo = [Block(row0=0, col0=64 * k, height=64, width=64) for k in range(10)]
+    todo = [Block(row0=0, col0=64 * k, height=64, width=64, tile=64) for k in range(10)]
     found = drawing._few_at_a_time(lambda b: b.col0, todo, SimpleNamespace(each=each))
     assert list(found) == [64 * k for k in range(10)]
     assert asked == [4, 4, 2]
