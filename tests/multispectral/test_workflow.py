@@ -181,10 +181,16 @@ def test_two_drones_and_black_files(flown, bare, tmp_path):
     assert [b["cameras"] for b in told["shown"]] == [2, 1, 2, 2, 2]
     assert sorted(told["photos_rejected"]) == ["SIM_0003_MS_NIR.TIF", "SIM_0007_MS_R.TIF"]
     texts = [e.text for e in before if isinstance(e, Note)]
-    assert "SIM_0003_MS_NIR.TIF is left out: all its pixels have one value" in texts
+    assert any("2 files are left out, SIM_0007_MS_R.TIF for one: all its" in t for t in texts)
     judgement = judged(tmp_path / "out", flown)
     assert judgement["beside green, median"] < 0.25 and judgement["factors differ by"] < 0.04
     assert judgement["NDVI off, median"] < 0.02
+    again = [
+        e.text
+        for e in iter_bands(tmp_path / "photos", tmp_path / "out", SETTINGS)
+        if isinstance(e, Note)
+    ]
+    assert any("already contains these bands" in text for text in again)
 
 
 def test_photos_without_bands_are_refused(flown, tmp_path):

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -115,6 +115,7 @@ class BandsDrawing:
     """What the rasters depend on."""
     tags: dict[str, str]
     """Metadata of the files."""
+    version: ClassVar[int] = 2
 
     def blocks(self, workers: Workers) -> Steps[None]:
         """Writes the rasters.

@@ -13,7 +13,7 @@ from skyquilt.coregistration.page import picture
 from skyquilt.model.photo import RejectedPhoto
 from skyquilt.multispectral.draw import BANDS_FILE, PlacedBand
 from skyquilt.multispectral.indices import INDICES, Index
-from skyquilt.multispectral.placing import Placing
+from skyquilt.multispectral.placing import Placing, left_out
 from skyquilt.raster.atomic import write_text
 from skyquilt.raster.colours import coloured
 from skyquilt.report.numbers import DASH, fixed, number, plain
@@ -159,7 +159,8 @@ def bands_section(
     """The section from the entry `bands` of metrics.json, and its pictures."""
     blocks: list[Block] = [_table(record["shown"]), *(picture(*p) for p in pictures)]
     said = [f"The band {n} is left out: {why}." for n, why in record["refused"].items()]
-    said += [f"{n} is left out: {why}." for n, why in record["photos_rejected"].items()]
+    files = [RejectedPhoto(name=n, reason=why) for n, why in record["photos_rejected"].items()]
+    said += [f"{sentence}." for sentence in left_out(files)]
     said += record["notes"]
     if said:
         blocks.append(Sentences(items=tuple(said)))

@@ -55,6 +55,8 @@ class Placing:
     """The reason by the name of each band that is not drawn."""
     lost: list[RejectedPhoto]
     """Files of the other bands that are not drawn, though they were taken with one that is."""
+    final: bool
+    """Whether another run of the same files would leave out the same."""
     notes: list[str]
     """What the user is told."""
 
@@ -97,7 +99,27 @@ def place_bands(scene: Scene, others: Sequence[Photo], workers: Workers) -> Step
     bands, kind, weaker = _comparable(placed)
     notes = [f"The band {name} is left out: {reason}." for name, reason in refused.items()]
     notes += [note for b in placed for note in _notes(b)] + weaker
-    return Placing(bands=bands, kind=kind, refused=refused, lost=lost, notes=notes)
+    return Placing(
+        bands=bands,
+        kind=kind,
+        refused=refused,
+        lost=lost,
+        final=not any(r.gone for r in recorded.values()),
+        notes=notes,
+    )
+
+
+def left_out(lost: Sequence[RejectedPhoto]) -> list[str]:
+    """A sentence for each reason why files are left out."""
+    alike: dict[str, list[str]] = {}
+    for photo in lost:
+        alike.setdefault(photo.reason, []).append(photo.name)
+    return [
+        f"{names[0]} is left out: {reason}"
+        if len(names) == 1
+        else f"{len(names)} files are left out, {names[0]} for one: {reason}"
+        for reason, names in alike.items()
+    ]
 
 
 def _recorded(bands: Sequence[BandFiles], workers: Workers) -> Steps[dict[str, Recorded]]:

@@ -32,6 +32,8 @@ class Recorded:
     """Why it is not drawn; empty where it is."""
     saturated: float = 0.0
     """Share of its pixels that are saturated."""
+    gone: bool = False
+    """Whether it changed or disappeared since it was found, so that another run may see it."""
 
 
 def look_at(item: tuple[Photo, Reflectance]) -> Recorded:
@@ -40,7 +42,8 @@ def look_at(item: tuple[Photo, Reflectance]) -> Recorded:
     try:
         pixels = read_color(photo)
     except Exception as error:  # whatever it is, it concerns this file alone
-        return Recorded(reason=lost(photo) or rejected(photo.name, error).reason)
+        gone = lost(photo)
+        return Recorded(reason=gone or rejected(photo.name, error).reason, gone=bool(gone))
     counts = np.asarray(pixels[::_EVERY, ::_EVERY], np.float32)
     known = counts[np.isfinite(counts)]
     if not known.size or known.min() == known.max():

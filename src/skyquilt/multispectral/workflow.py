@@ -23,7 +23,7 @@ from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.multispectral.draw import BANDS_FILE, BandsDrawing, PlacedBand
 from skyquilt.multispectral.indices import indices_of
 from skyquilt.multispectral.page import band_figures, write_bands
-from skyquilt.multispectral.placing import place_bands
+from skyquilt.multispectral.placing import left_out, place_bands
 from skyquilt.multispectral.reflectance import Kind
 from skyquilt.multispectral.rig import FindBandRig
 from skyquilt.photos.headers import content_digest
@@ -94,8 +94,7 @@ def _bands(made: FinishedMap, others: Sequence[Photo]) -> Generator[Event, None,
     placing = place_bands(scene, others, clock.workers)
     placed = yield from clock.stage("rig", placing, keeps=False)
     bands, lost = placed.bands, placed.lost
-    left_out = [f"{photo.name} is left out: {photo.reason}" for photo in lost]
-    yield from (Note(text=text, warning=True) for text in (*placed.notes, *left_out))
+    yield from (Note(text=t, warning=True) for t in (*placed.notes, *left_out(placed.lost)))
     while True:
         drawing = _drawing(made, scene, bands, placed.kind, clock, key)
         try:
@@ -108,7 +107,8 @@ def _bands(made: FinishedMap, others: Sequence[Photo]) -> Generator[Event, None,
     values, indices = drawing.tags["VALUES"], [i.name for i in drawing.indices]
     files = _stamps(output, (BANDS_FILE, *(f"{name}.tif" for name in indices)))
     told = band_figures(bands, placed, lost, values, indices)
-    figures = {"bands": told | {"key": "" if lost else key, "files": files}}
+    final = placed.final and len(lost) == len(placed.lost)
+    figures = {"bands": told | {"key": key if final else "", "files": files}}
     write_bands(output, made.result.metrics, figures)
     yield Result(output=output, metrics={**made.result.metrics, **figures})
 
