@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from datetime import UTC
 from functools import cached_property
 
 import numpy as np
@@ -115,7 +116,7 @@ def _converting(files: Sequence[tuple[Photo, BandTags]]) -> tuple[Reflectance, .
     """How each file's counts become values, with the irradiance smoothed over the flight."""
     found = [Reflectance.of(tags, photo.width, photo.height) for photo, tags in files]
     times: NDArray[np.float64] = np.array(
-        [np.nan if p.time is None else p.time.replace(tzinfo=None).timestamp() for p, _ in files]
+        [np.nan if p.time is None else p.time.replace(tzinfo=UTC).timestamp() for p, _ in files]
     )
     read = np.array([np.nan if c.irradiance is None else c.irradiance for c in found])
     smooth = smoothed_irradiance(times, read)

@@ -2,9 +2,11 @@
 
 import re
 from collections.abc import Sequence
+from datetime import UTC
 from pathlib import PurePosixPath
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skyquilt.model.photo import Photo
 
@@ -53,20 +55,27 @@ def nearest_in_time(a: Sequence[Photo], b: Sequence[Photo], most_s: float) -> li
     """Pairs (index of a, index of b) of photos of one clock, each of which is nearest in time to
     the other, less than `most_s` seconds apart, and at one place. By ascending index of b.
     """
-    if not (a and b):
-        return []
-    times = [
-        np.array([np.nan if p.time is None else p.time.replace(tzinfo=None).timestamp() for p in s])
-        for s in (a, b)
-    ]
-    gap = np.abs(times[0][:, None] - times[1][None, :])
-    gap[~(gap < most_s)] = np.inf
-    for i, j in np.argwhere(np.isfinite(gap)):
-        if not _possible(a[i], b[j]):
-            gap[i, j] = np.inf
-    first = gap.argmin(0)
-    pairs = [(int(i), j) for j, i in enumerate(first) if gap[i].argmin() == j]
-    return [(i, j) for i, j in pairs if np.isfinite(gap[i, j])]
+    of_a, of_b = (_clocks(photos) for photos in (a, b))
+    order = np.argsort(of_a, kind="stable")[: int(np.isfinite(of_a).sum())]
+    sorted_a = of_a[order]
+    nearest: dict[int, tuple[float, int]] = {}
+    for j, time in enumerate(of_b):
+        if not np.isfinite(time):
+            continue
+        low, high = np.searchsorted(sorted_a, [time - most_s, time + most_s])
+        gaps = [(abs(float(of_a[i] - time)), int(i)) for i in order[low:high]]
+        found = [(gap, i) for gap, i in gaps if gap < most_s and _possible(a[i], b[j])]
+        if found and min(found)[0] < nearest.get(min(found)[1], (np.inf, 0))[0]:
+            nearest[min(found)[1]] = min(found)[0], j
+    return sorted(((i, j) for i, (_, j) in nearest.items()), key=lambda pair: pair[1])
+
+
+def _clocks(photos: Sequence[Photo]) -> NDArray[np.float64]:
+    """(n,) times in s by the photos' own clocks, whatever their zones; NaN where there is none."""
+    return np.array(
+        [np.nan if p.time is None else p.time.replace(tzinfo=UTC).timestamp() for p in photos],
+        np.float64,
+    )
 
 
 def _narrow(photo: Photo) -> float:
