@@ -65,7 +65,7 @@ def values_in(output):
 
 
 def test_all_bands_lie_on_the_map(bare, output):
-    assert {"mosaic", "ndvi", "ndre", "gndvi"} <= set(layers_in(output))
+    assert {"mosaic", "infrared", "ndvi", "ndre", "gndvi"} <= set(layers_in(output))
     with rasterio.open(output / "bands.tif") as b, rasterio.open(output / "mosaic.tif") as m:
         assert b.descriptions == ("blue", "green", "red", "red edge", "nir")
         assert (b.transform, b.shape, b.crs) == (m.transform, m.shape, m.crs)
@@ -75,6 +75,22 @@ def test_all_bands_lie_on_the_map(bare, output):
     assert (np.isfinite(values["green"]) == shown).mean() > 0.999
     for name, band in values.items():
         assert np.isfinite(band[shown]).mean() > 0.93, name
+
+
+def test_the_infrared_picture_is_of_three_bands(output):
+    """Brighter where a band is, black and white at its ends, and where all three are known."""
+    values = values_in(output)
+    with rasterio.open(output / "infrared.tif") as source:
+        picture, shown = source.read(), source.dataset_mask() > 0
+    bands = np.stack([values[name] for name in ("nir", "red", "green")])
+    known = np.isfinite(bands).all(0)
+    assert (known == shown).all()
+    for band, colour in zip(bands, picture, strict=True):
+        low, high = np.percentile(band[known], [2, 98])
+        assert colour[known & (band <= low)].mean() < 40
+        assert colour[known & (band >= high)].mean() > 240
+        order = np.corrcoef(band[known] ** (1 / 1.8), colour[known])[0, 1]
+        assert order > 0.97
 
 
 def test_bands_are_those_of_the_truth(flown, output):

@@ -42,6 +42,7 @@ FILES = {
     "mosaic.tif": "map",
     "thermal.tif": "thermal map",
     "bands.tif": "all bands",
+    "infrared.tif": "colour infrared",
     "ndvi.tif": "NDVI",
     "ndre.tif": "NDRE",
     "gndvi.tif": "GNDVI",
@@ -60,7 +61,8 @@ FILES = {
     "run.toml": "settings",
 }
 """Files of a run, in the order of the links."""
-ADDED = ("thermal.tif", "bands.tif", "ndvi.tif", "ndre.tif", "gndvi.tif")
+THERMAL_FILE = "thermal.tif"
+ADDED = (THERMAL_FILE, "bands.tif", "infrared.tif", "ndvi.tif", "ndre.tif", "gndvi.tif")
 """Those that are added to a finished run."""
 LASTING = tuple(name for name in FILES if name not in ("metrics.json", *ADDED))
 """Those that nothing changes once the run is finished."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from skyquilt.coregistration.page import picture
 from skyquilt.model.photo import RejectedPhoto
+from skyquilt.multispectral.composite import INFRARED, composed, ends_of, reduced
 from skyquilt.multispectral.draw import BANDS_FILE, PlacedBand
 from skyquilt.multispectral.indices import INDICES, Index
 from skyquilt.multispectral.placing import Placing, left_out
@@ -36,7 +37,7 @@ _VALUES = {
 }
 _COMPOSITES = (
     (
-        ("nir", "red", "green"),
+        INFRARED,
         "Colour infrared",
         "Near infrared, red and green as red, green and blue: plants are red.",
     ),
@@ -107,7 +108,7 @@ def pictures_of(output: Path) -> list[tuple[NDArray[np.uint8], str, str]]:
     found = []
     with rasterio.open(output / BANDS_FILE) as source:
         names = [name or "" for name in source.descriptions]
-        small = _small(source)
+        small = reduced(source, LONGEST)
     for wanted, title, caption in _COMPOSITES:
         if set(wanted) <= set(names):
             found.append((_composite([small[names.index(n)] for n in wanted]), title, caption))
@@ -118,25 +119,10 @@ def pictures_of(output: Path) -> list[tuple[NDArray[np.uint8], str, str]]:
     return found
 
 
-def _small(source: Any) -> NDArray[np.float32]:
-    """All bands (n, h, w) reduced to the page's size."""
-    factor = max(1.0, max(source.width, source.height) / LONGEST)
-    size = (
-        source.count,
-        max(1, round(source.height / factor)),
-        max(1, round(source.width / factor)),
-    )
-    return np.asarray(source.read(out_shape=size), np.float32)
-
-
 def _composite(bands: Sequence[NDArray[np.float32]]) -> NDArray[np.uint8]:
-    out, known = [], np.isfinite(np.stack(bands)).all(0)
-    for values in bands:
-        low, high = np.percentile(values[known], [1, 99]) if known.any() else (0.0, 1.0)
-        # the eye is used to pictures that are brighter in the dark
-        share = np.clip((values - low) / max(float(high - low), 1e-9), 0, 1) ** (1 / 1.8)
-        out.append(np.where(known, np.nan_to_num(share) * 255, 255))
-    return np.asarray(np.rint(np.stack(out, -1)), np.uint8)
+    rgb, known = composed(bands, [ends_of(values) for values in bands])
+    rgb[~known] = 255
+    return rgb
 
 
 def _index_picture(values: NDArray[np.float32], index: Index) -> tuple[NDArray[np.uint8], str, str]:

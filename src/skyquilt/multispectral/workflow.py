@@ -13,19 +13,21 @@ from pathlib import Path
 from typing import Any
 
 from skyquilt.engine.clock import Clock, result_of
-from skyquilt.engine.folder import STATE, stamp
+from skyquilt.engine.folder import ADDED, STATE, THERMAL_FILE, stamp
 from skyquilt.engine.pixel_cache import pixel_budget
 from skyquilt.engine.store import Store, digest
 from skyquilt.engine.workers import Threads
 from skyquilt.errors import PhotoFailedError, UsageError
 from skyquilt.model.event import Event, Note, Result
 from skyquilt.model.photo import Photo, RejectedPhoto
+from skyquilt.multispectral.composite import INFRARED_FILE, write_infrared
 from skyquilt.multispectral.draw import BANDS_FILE, BandsDrawing, PlacedBand
 from skyquilt.multispectral.indices import indices_of
 from skyquilt.multispectral.page import band_figures, write_bands
 from skyquilt.multispectral.placing import left_out, place_bands
 from skyquilt.multispectral.reflectance import Kind
 from skyquilt.multispectral.rig import FindBandRig
+from skyquilt.outside import remove_file
 from skyquilt.photos.headers import content_digest
 from skyquilt.photos.read import ReadFiles
 from skyquilt.settings import MosaicSettings
@@ -105,7 +107,11 @@ def _bands(made: FinishedMap, others: Sequence[Photo]) -> Generator[Event, None,
             lost = [*lost, RejectedPhoto(name=error.photo, reason=error.reason)]
             yield Note(text=f"{error.photo} is left out: {error.reason}", warning=True)
     values, indices = drawing.tags["VALUES"], [i.name for i in drawing.indices]
-    files = _stamps(output, (BANDS_FILE, *(f"{name}.tif" for name in indices)))
+    made_files = [BANDS_FILE, *(f"{name}.tif" for name in indices)]
+    made_files += [INFRARED_FILE] if write_infrared(output) else []
+    for name in {*ADDED} - {*made_files, THERMAL_FILE}:  # of an earlier run with other bands
+        remove_file(output / name)
+    files = _stamps(output, made_files)
     told = band_figures(bands, placed, lost, values, indices)
     final = placed.final and len(lost) == len(placed.lost)
     figures = {"bands": told | {"key": key if final else "", "files": files}}

@@ -43,6 +43,7 @@ class RunLayer:
 LAYERS = (
     RunLayer(name="mosaic", title="Map", file="mosaic.tif"),
     RunLayer(name="thermal", title="Thermal", file="thermal.tif", measured=True),
+    RunLayer(name="infrared", title="Colour infrared", file="infrared.tif"),
     RunLayer(name="ndvi", title="NDVI", file="ndvi.tif", palette="plants", measured=True),
     RunLayer(name="ndre", title="NDRE", file="ndre.tif", palette="plants", measured=True),
     RunLayer(name="gndvi", title="GNDVI", file="gndvi.tif", palette="plants", measured=True),
