@@ -30,8 +30,10 @@ CLOCK_S = 1.0
 ALIKE = 0.9
 """Share of the most photos with which another time zone fits, too."""
 _PER_DAY_DEG = 15.0
-_SUMMER_DEG, _SUMMER = 30.0, range(4, 11)
-"""Latitude from which clocks are often put forward in summer, and months of the northern one."""
+_SUMMER_DEG, _SUMMER = 30.0, (4, 10)
+"""Latitude from which clocks are often put forward in summer, first and last month of the northern
+one.
+"""
 _ODD_H = 1.0
 """Zones that are no whole hours from UTC are as rare as those an hour further from the sun's."""
 
@@ -138,7 +140,7 @@ def _from_sun(fit: _Fit, track: Track) -> float:
     """How far in hours a time zone lies from where the sun and the season would put it."""
     latitude, hours = float(np.median(track.latitude_deg)), -fit.offset_s / 3600
     month = datetime.fromtimestamp(float(track.time_s[0]), UTC).month
-    summer = abs(latitude) > _SUMMER_DEG and (month in _SUMMER) == (latitude > 0)
+    summer = abs(latitude) > _SUMMER_DEG and (_SUMMER[0] <= month <= _SUMMER[1]) == (latitude > 0)
     sun = float(np.median(track.longitude_deg)) / _PER_DAY_DEG + summer
     return abs(hours - sun) + _ODD_H * (hours % 1 != 0)
 
