@@ -136,6 +136,9 @@ def run(monkeypatch, *words):
         (["--rerun-from", "lunch"], 2, "features, links, align"),
         (["--quiet", "--json"], 2, "exclude one another"),
         (["--thermal-route", "lunch"], 2, "needs --thermal"),
+        (["--all-bands", "--add"], 2, "--add and --all-bands exclude one another"),
+        (["--all-bands", "--thermal", "."], 2, "--all-bands and --thermal exclude one another"),
+        (["--all-bands"], 3, ""),
         ([], 3, ""),
     ],
 )

@@ -7,6 +7,7 @@ import pytest
 import rasterio
 from benchmarks.multispectral import judged
 
+from skyquilt.cli.mosaic import with_bands
 from skyquilt.errors import UsageError
 from skyquilt.model.event import Note, Result, StageStarted
 from skyquilt.multispectral import placing, workflow
@@ -125,6 +126,14 @@ def test_figures_and_report(bare, output):
     assert last.metrics["photos_total"] == 9  # files of other bands are drawn, not left out
     page = (output / "report.html").read_text(encoding="utf-8")
     assert "Bands of bands.tif" in page and "Colour infrared" in page and page.count("NDVI") > 1
+
+
+def test_the_summary_names_the_files(bare, output):
+    *_, last = iter_bands(bare, output, SETTINGS)
+    assert with_bands(last).splitlines()[-1] == (
+        f"bands:  {output / 'bands.tif'} (blue, green, red, red edge, nir; values: relative),"
+        " ndvi.tif, ndre.tif, gndvi.tif, infrared.tif"
+    )
 
 
 def test_the_same_command_does_nothing_or_mends(bare, output):

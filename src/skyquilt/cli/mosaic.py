@@ -484,10 +484,10 @@ def with_bands(result: "Result") -> str:
 
     told = result.metrics["bands"]
     names = ", ".join(b["name"] for b in told["shown"])
-    indices = "".join(f", {name}.tif" for name in told["indices"])
+    more = "".join(f", {name}" for name in told["files"] if name != "bands.tif")
     return (
         f"{mosaic_summary(result)}\nbands:  {result.output / 'bands.tif'} ({names}; values:"
-        f" {told['values']}){indices}"
+        f" {told['values']}){more}"
     )
 
 
