@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from skyquilt.coregistration.orientation import orientation
 from skyquilt.geometry.camera import project, rays
 from skyquilt.geometry.frames import rotation_from_vector
 from skyquilt.model.camera import Camera
@@ -80,3 +81,12 @@ def test_two_captures_are_too_few():
     found = FindBandRig()(captures(a, b, 2), b.camera, 0.01)
     assert isinstance(found, RefusedRegistration)
     assert found.reason.startswith("2 of its photos were taken together")
+
+
+def test_quick_fields_are_nearly_the_same():
+    grey = texture(360, 480, seed=1)
+    valid = np.ones(grey.shape, np.bool_)
+    valid[:60] = False
+    slow, quick = (orientation(grey, valid, 400, quick=q) for q in (False, True))
+    assert 0 < np.abs(slow.fields - quick.fields).max() < 0.03
+    assert (slow.valid == quick.valid).all()

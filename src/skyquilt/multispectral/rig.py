@@ -101,7 +101,7 @@ class FindBandRig:
     """
     minimum: int = 3
     """Fewest pairs of photos."""
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     def __call__(
         self, pairs: Sequence[Together], camera_b: Camera, sigma_focal: float
@@ -156,7 +156,7 @@ class FindBandRig:
             b = known.setdefault((k, side), _oriented(pair.b, side))
             small = _small(camera, b)
             at, seen, valid = _seen(pair, R, small, b.shape)
-            a = orientation(seen, valid, float(np.sqrt(seen.size)))
+            a = orientation(seen, valid, float(np.sqrt(seen.size)), quick=True)
             shifts = agree.shifts(a, b, np.eye(3))
             within = np.abs(shifts.shift).max(1, initial=0) < reach - 0.5
             px_b = _full(shifts.px + shifts.shift, small, camera)[within]
@@ -248,7 +248,7 @@ def _scale(camera: Camera, side: int) -> float:
 
 
 def _oriented(grey: NDArray[np.uint8], side: int) -> Orientation:
-    return orientation(grey.astype(np.float32), np.ones(grey.shape, np.bool_), side)
+    return orientation(grey.astype(np.float32), np.ones(grey.shape, np.bool_), side, quick=True)
 
 
 def _small(camera: Camera, reduced: Orientation) -> Camera:
