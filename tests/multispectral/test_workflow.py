@@ -218,6 +218,21 @@ def test_two_drones_and_black_files(flown, bare, tmp_path):
     assert any("already contains these bands" in text for text in again)
 
 
+def test_a_band_of_other_captures_is_left_out(bare, tmp_path):
+    """None of its files was taken together with one of the map's."""
+    shutil.copytree(bare, tmp_path / "photos")
+    for path in (tmp_path / "photos").glob("*_MS_B.TIF"):
+        raw = path.read_bytes().replace(b"2024:07:15", b"2023:07:15")
+        assert raw.count(b'CaptureUUID="0') == 1
+        path.write_bytes(raw.replace(b'CaptureUUID="0', b'CaptureUUID="9'))
+        path.rename(path.with_name(path.name.replace("SIM_00", "SIM_11")))
+    *before, last = iter_bands(tmp_path / "photos", tmp_path / "out", SETTINGS)
+    told = last.metrics["bands"]
+    assert list(told["refused"]) == ["blue"]
+    assert told["refused"]["blue"].startswith("0 of its photos were taken together with one")
+    assert [b["name"] for b in told["shown"]] == ["green", "red", "red edge", "nir"]
+
+
 def test_photos_without_bands_are_refused(flown, tmp_path):
     with pytest.raises(UsageError, match="--all-bands needs files that each show one band"):
         list(iter_bands(flown / "photos", tmp_path / "out", SETTINGS))

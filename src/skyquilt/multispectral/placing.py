@@ -13,7 +13,7 @@ from skyquilt.engine.clock import Steps
 from skyquilt.engine.workers import Workers
 from skyquilt.imaging.grey import shrink, to_grey8
 from skyquilt.model.camera import Camera
-from skyquilt.model.photo import Photo, RejectedPhoto
+from skyquilt.model.photo import Photo, RejectedPhoto, evenly
 from skyquilt.model.registration import RefusedRegistration
 from skyquilt.multispectral.captures import (
     THERMAL,
@@ -161,7 +161,7 @@ def _rig(scene: Scene, band: BandFiles, of_photo: dict[int, int]) -> BandRig | R
             reason="the map's photos have no adjusted poses; use --method bundle"
         )
     pairs = _far(scene, pairs)
-    asked = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, MOST_PAIRS).astype(int))]
+    asked = [pairs[k] for k in evenly(len(pairs), MOST_PAIRS)]
     seen = [t for i, j in asked if (t := _together(aligned, i, band.photos[j])) is not None]
     first = band.photos[pairs[0][1]] if pairs else None
     camera = Camera.ideal(width=1, height=1, focal=1.0) if first is None else first.lens
