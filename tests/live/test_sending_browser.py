@@ -52,6 +52,14 @@ def requests(page):
     return found
 
 
+def parts_go(page, through):
+    """What becomes of each part of a file; other requests go as they are."""
+    page.route(
+        "**/photos/uploads/*",
+        lambda r: through(r) if r.request.method == "PATCH" else r.continue_(),
+    )
+
+
 def test_photos_are_sent_and_refusals_told(page, flight, tmp_path):
     note = tmp_path / "notes.jpg"
     note.write_text("no photo")
@@ -83,10 +91,7 @@ def test_a_lost_connection_is_waited_for_and_nothing_is_sent_twice(page, large, 
             else:
                 route.continue_()
 
-        page.route(
-            "**/photos/uploads/*",
-            lambda r: weak(r) if r.request.method == "PATCH" else r.continue_(),
-        )
+        parts_go(page, weak)
         page.set_input_files("#files", [large])
         holds(page, f"{WORDS} === '1 of 1 sent'")
         holds(page, "skyquilt.state.photos.size === 1")
@@ -113,10 +118,7 @@ def test_an_upload_that_expired_begins_again(page, large, tmp_path):
             else:
                 route.continue_()
 
-        page.route(
-            "**/photos/uploads/*",
-            lambda r: forgotten(r) if r.request.method == "PATCH" else r.continue_(),
-        )
+        parts_go(page, forgotten)
         page.set_input_files("#files", [large])
         holds(page, f"{WORDS} === '1 of 1 sent'")
         assert [method for method, _ in sent].count("POST") == 2
@@ -127,10 +129,7 @@ def test_an_upload_that_expired_begins_again(page, large, tmp_path):
 def test_sending_is_stopped(page, flight, large, tmp_path):
     with served(tmp_path / "out", QUICK) as site:
         opened(page, site)
-        page.route(
-            "**/photos/uploads/*",
-            lambda r: r.abort() if r.request.method == "PATCH" else r.continue_(),
-        )
+        parts_go(page, lambda r: r.abort())
         page.set_input_files("#files", [large, flight.photos[0]])
         holds(
             page,

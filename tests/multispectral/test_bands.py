@@ -15,6 +15,7 @@ from skyquilt.multispectral.captures import bands_of_files, captured_together
 from skyquilt.multispectral.draw import BandsDrawing, averaged
 from skyquilt.multispectral.indices import INDICES, indices_of
 from skyquilt.multispectral.placing import _far, _weaker
+from skyquilt.multispectral.reflectance import common_kind
 from skyquilt.photos.band_tags import BandTags
 from skyquilt.photos.together import SECONDS, nearest_in_time
 from skyquilt.raster import Block
@@ -49,7 +50,7 @@ def test_bands_are_in_order_of_wavelength(files):
     assert [b.name for b in found] == ["green", "red edge", "nir"]
     assert [b.wavelength_nm for b in found] == [560.0, 730.0, 860.0]
     assert all(len(b.photos) == len(b.tags) == len(b.converts) == 5 for b in found)
-    assert {b.kind for b in found} == {"relative"}
+    assert {common_kind(b.converts) for b in found} == {"relative"}
 
 
 def test_irradiance_is_smoothed(files):

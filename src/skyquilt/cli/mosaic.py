@@ -410,22 +410,9 @@ def command(
         optimiser=optimiser,
         lines=lines,
     )
-    if thermal is None:
-        if thermal_route != "auto":
-            raise UsageError(
-                f"--thermal-route {thermal_route!r} needs --thermal, a folder of photos"
-            )
-        if all_bands:
-            from skyquilt.multispectral.workflow import iter_bands
-
-            events = iter_bands(
-                source, output, settings, overwrite=overwrite, rerun_from=rerun_from
-            )
-        else:
-            events = iter_mosaic(
-                source, output, settings, overwrite=overwrite, rerun_from=rerun_from, add=add
-            )
-    else:
+    if thermal is None and thermal_route != "auto":
+        raise UsageError(f"--thermal-route {thermal_route!r} needs --thermal, a folder of photos")
+    if thermal is not None:
         from skyquilt.thermal.workflow import iter_thermal
 
         if len(photos) > 1:
@@ -438,6 +425,14 @@ def command(
             route=thermal_route,
             overwrite=overwrite,
             rerun_from=rerun_from,
+        )
+    elif all_bands:
+        from skyquilt.multispectral.workflow import iter_bands
+
+        events = iter_bands(source, output, settings, overwrite=overwrite, rerun_from=rerun_from)
+    else:
+        events = iter_mosaic(
+            source, output, settings, overwrite=overwrite, rerun_from=rerun_from, add=add
         )
     advice = "the same command resumes, with --memory smaller or --max-memory larger"
     with ends_run(limit_bytes(max_memory), advice):

@@ -2,24 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from datetime import UTC
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyquilt.errors import UnreadablePhotoError
 from skyquilt.model.bands import canonical
 from skyquilt.model.photo import Photo
-from skyquilt.multispectral.reflectance import (
-    KINDS,
-    Kind,
-    Reflectance,
-    common_kind,
-    smoothed_irradiance,
-)
+from skyquilt.multispectral.reflectance import KINDS, Kind, Reflectance, smoothed_irradiance
 from skyquilt.photos.band_tags import BandTags, read_band_tags
-from skyquilt.photos.together import SECONDS, nearest_in_time, taken_together
+from skyquilt.photos.together import SECONDS, clocks, nearest_in_time, taken_together
 
 THERMAL = "lwir"
 """The band of temperatures, which says nothing of reflectance."""
@@ -43,11 +35,6 @@ class BandFiles:
         """Wavelength at its centre in nm; None where no file tells it."""
         told = [t.wavelength_nm for t in self.tags if t.wavelength_nm is not None]
         return float(np.median(told)) if told else None
-
-    @property
-    def kind(self) -> Kind:
-        """What the values of all its files can be taken for."""
-        return common_kind(self.converts)
 
     @property
     def order(self) -> tuple[float, str]:
@@ -115,11 +102,8 @@ def tags_of(photo: Photo) -> BandTags:
 def _converting(files: Sequence[tuple[Photo, BandTags]]) -> tuple[Reflectance, ...]:
     """How each file's counts become values, with the irradiance smoothed over the flight."""
     found = [Reflectance.of(tags, photo.width, photo.height) for photo, tags in files]
-    times: NDArray[np.float64] = np.array(
-        [np.nan if p.time is None else p.time.replace(tzinfo=UTC).timestamp() for p, _ in files]
-    )
     read = np.array([np.nan if c.irradiance is None else c.irradiance for c in found])
-    smooth = smoothed_irradiance(times, read)
+    smooth = smoothed_irradiance(clocks([photo for photo, _ in files]), read)
     return tuple(
         c if np.isnan(light) else c.with_irradiance(float(light))
         for c, light in zip(found, smooth, strict=True)

@@ -34,9 +34,9 @@ from skyquilt.ortho.compose import Composer
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.labels import Labels
 from skyquilt.ortho.orthomosaic import keeper
-from skyquilt.photos.pixels import lost, read_color
-from skyquilt.photos.read import rejected
+from skyquilt.photos.pixels import lost
 from skyquilt.raster import Block, CogWriter, RasterSpec
+from skyquilt.workflows.photo_features import pixels_again
 
 BANDS_FILE = "bands.tif"
 _LARGER = 1.5
@@ -291,11 +291,7 @@ def _pixels(photo: Photo) -> NDArray[Any]:
     Raises:
         PhotoFailedError: it cannot be read any more.
     """
-    try:
-        pixels = read_color(photo)
-    except Exception as error:  # whatever it is, it concerns this photo alone
-        reason = lost(photo) or rejected(photo.name, error).reason
-        raise PhotoFailedError(photo.name, reason) from error
+    pixels = pixels_again(photo)
     if reason := lost(photo):
         raise PhotoFailedError(photo.name, reason)
     return np.asarray(pixels[..., 0] if pixels.ndim == 3 else pixels)

@@ -1,6 +1,5 @@
 """What the bands add to a finished run: figures, and a section of the report with pictures."""
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,10 +14,9 @@ from skyquilt.multispectral.composite import INFRARED, composed, ends_of, reduce
 from skyquilt.multispectral.draw import BANDS_FILE, PlacedBand
 from skyquilt.multispectral.indices import INDICES, Index
 from skyquilt.multispectral.placing import Placing, left_out
-from skyquilt.raster.atomic import write_text
 from skyquilt.raster.colours import coloured
 from skyquilt.report.numbers import DASH, fixed, number, plain
-from skyquilt.report.page import with_section, write_page
+from skyquilt.report.page import add_section
 from skyquilt.report.parts import Block, Section, Sentences, Table
 
 LONGEST = 1000
@@ -92,15 +90,9 @@ def _figures(band: PlacedBand) -> dict[str, Any]:
     }
 
 
-def write_bands(output: Path, visual: Mapping[str, Any], figures: Mapping[str, Any]) -> None:
-    """Adds a section to the report, and the figures to metrics.json."""
-    page = output / "report.html"
-    if page.is_file():
-        section = bands_section(figures["bands"], pictures_of(output))
-        write_page(page, with_section(page.read_text(encoding="utf-8"), section))
-    write_text(
-        output / "metrics.json", json.dumps({**visual, **figures}, indent=1, allow_nan=False)
-    )
+def write_section(output: Path, record: Mapping[str, Any]) -> None:
+    """Adds a section to the report, from the entry `bands` of metrics.json."""
+    add_section(output, bands_section(record, pictures_of(output)))
 
 
 def pictures_of(output: Path) -> list[tuple[NDArray[np.uint8], str, str]]:

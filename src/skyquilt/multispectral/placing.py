@@ -24,7 +24,7 @@ from skyquilt.multispectral.captures import (
 )
 from skyquilt.multispectral.draw import PlacedBand
 from skyquilt.multispectral.recorded import Recorded, look_at
-from skyquilt.multispectral.reflectance import KINDS, Kind
+from skyquilt.multispectral.reflectance import KINDS, Kind, common_kind
 from skyquilt.multispectral.rig import BandRig, FindBandRig, Together
 from skyquilt.photos.pixels import read_color
 from skyquilt.workflows.flow import AlignedPhotos, Scene
@@ -70,7 +70,8 @@ def place_bands(scene: Scene, others: Sequence[Photo], workers: Workers) -> Step
     found = bands_of_files(others)
     recorded = yield from _recorded([*own, *found], workers)
     placed = [PlacedBand(files=b, of_photo=_own_files(aligned, b)) for b in own]
-    captures = [tags_of(p).capture for p in aligned.photos]
+    known_tags = {p.name: t for b in own for p, t in zip(b.photos, b.tags, strict=True)}
+    captures = [(known_tags.get(p.name) or tags_of(p)).capture for p in aligned.photos]
     refused: dict[str, str] = {}
     lost: list[RejectedPhoto] = []
     for done, band in enumerate(found):
@@ -199,7 +200,7 @@ def _comparable(placed: Sequence[PlacedBand]) -> tuple[list[PlacedBand], Kind, l
     told = {
         b.files.photos[j].name: b.files.converts[j].kind for b in light for j in b.of_photo.values()
     }
-    kind: Kind = min(told.values(), key=KINDS.index, default="counts")
+    kind = common_kind([b.files.converts[j] for b in light for j in b.of_photo.values()])
     bands = [
         b if b.files.name == THERMAL else replace(b, files=b.files.as_kind(kind)) for b in placed
     ]

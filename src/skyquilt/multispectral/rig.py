@@ -155,12 +155,12 @@ class FindBandRig:
         for k, pair in enumerate(pairs):
             b = known.setdefault((k, side), _oriented(pair.b, side))
             small = _small(camera, b)
-            at, seen, valid = _seen(pair, R, small, b.shape)
+            seen, valid = _seen(pair, R, small, b.shape)
             a = orientation(seen, valid, float(np.sqrt(seen.size)), quick=True)
             shifts = agree.shifts(a, b, np.eye(3))
             within = np.abs(shifts.shift).max(1, initial=0) < reach - 0.5
             px_b = _full(shifts.px + shifts.shift, small, camera)[within]
-            px_a = at(shifts.px[within])
+            px_a = _there(shifts.px[within], R, small, pair.camera_a)
             rows.append((px_a, px_b, np.full(len(px_a), k, np.intp)))
         px_a, px_b, pair_ = (np.concatenate([row[n] for row in rows]) for n in range(3))
         return _Matched(px_a=px_a, px_b=px_b, pair=pair_, camera_a=pairs[0].camera_a)
@@ -263,25 +263,21 @@ def _full(px: Array, small: Camera, full: Camera) -> Array:
     return np.asarray((px + 0.5) * scale - 0.5)
 
 
-class _Projected:
-    """Where places of a reduced band lie in the photo of the map."""
-
-    def __init__(self, R: Array, small: Camera, camera_a: Camera) -> None:
-        self._R, self._small, self._camera_a = R, small, camera_a
-
-    def __call__(self, px: Array) -> Array:
-        """(n, 2) px of the full photo of the map; NaN where it does not see the place."""
-        return np.asarray(project(self._camera_a, rays(self._small, px) @ self._R))
+def _there(px: Array, R: Array, small: Camera, camera_a: Camera) -> Array:
+    """Places (n, 2) of a reduced band in px of the full photo of the map; NaN where it does not see
+    them.
+    """
+    return np.asarray(project(camera_a, rays(small, px) @ R))
 
 
 def _seen(
     pair: Together, R: Array, small: Camera, shape: tuple[int, int]
-) -> tuple[_Projected, NDArray[Any], NDArray[np.bool_]]:
+) -> tuple[NDArray[Any], NDArray[np.bool_]]:
     """The photo of the map as the reduced band (h, w) sees it, and where it shows anything."""
-    at, (h, w) = _Projected(R, small, pair.camera_a), shape
+    h, w = shape
     rows, columns = (np.arange(0, n + _NODE, _NODE, dtype=np.float64) for n in (h, w))
     x, y = np.meshgrid(columns, rows)
-    there = at(np.c_[x.ravel(), y.ravel()]).reshape(*x.shape, 2)
+    there = _there(np.c_[x.ravel(), y.ravel()], R, small, pair.camera_a).reshape(*x.shape, 2)
     scale = max(pair.a.shape) / max(pair.camera_a.width, pair.camera_a.height)
     there = ((there + 0.5) * scale - 0.5).astype(np.float32)
     # nodes of an enlarged image, whose corners lie at the first and the last node
@@ -299,7 +295,7 @@ def _seen(
     seen = cv2.remap(source, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     height, width = pair.a.shape
     valid = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
-    return at, seen.astype(np.float32), valid
+    return seen.astype(np.float32), valid
 
 
 def _off(found: _Matched, turn: Array, camera: Camera) -> Array:

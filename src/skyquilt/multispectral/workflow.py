@@ -23,7 +23,7 @@ from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.multispectral.composite import INFRARED_FILE, write_infrared
 from skyquilt.multispectral.draw import BANDS_FILE, BandsDrawing, PlacedBand
 from skyquilt.multispectral.indices import indices_of
-from skyquilt.multispectral.page import band_figures, write_bands
+from skyquilt.multispectral.page import band_figures, write_section
 from skyquilt.multispectral.placing import left_out, place_bands
 from skyquilt.multispectral.reflectance import Kind
 from skyquilt.multispectral.rig import FindBandRig
@@ -36,6 +36,7 @@ from skyquilt.version import __version__
 from skyquilt.workflows.artefacts import REGISTRY
 from skyquilt.workflows.flow import Scene, exposure_of, labels_of, scene_of
 from skyquilt.workflows.mosaic import FinishedMap, make_map
+from skyquilt.workflows.run_report import write_figures
 from skyquilt.workflows.survey_input import Source, SurveyInput, read_input
 
 
@@ -115,8 +116,10 @@ def _bands(made: FinishedMap, others: Sequence[Photo]) -> Generator[Event, None,
     told = band_figures(bands, placed, lost, values, indices)
     final = placed.final and len(lost) == len(placed.lost)
     figures = {"bands": told | {"key": key if final else "", "files": files}}
-    write_bands(output, made.result.metrics, figures)
-    yield Result(output=output, metrics={**made.result.metrics, **figures})
+    metrics = {**made.result.metrics, **figures}
+    write_section(output, figures["bands"])
+    write_figures(output, metrics)
+    yield Result(output=output, metrics=metrics)
 
 
 def _key(made: FinishedMap, scene: Scene, others: Sequence[Photo]) -> str:

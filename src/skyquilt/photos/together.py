@@ -55,7 +55,7 @@ def nearest_in_time(a: Sequence[Photo], b: Sequence[Photo], most_s: float) -> li
     """Pairs (index of a, index of b) of photos of one clock, each of which is nearest in time to
     the other, less than `most_s` seconds apart, and at one place. By ascending index of b.
     """
-    of_a, of_b = (_clocks(photos) for photos in (a, b))
+    of_a, of_b = (clocks(photos) for photos in (a, b))
     order = np.argsort(of_a, kind="stable")[: int(np.isfinite(of_a).sum())]
     sorted_a = of_a[order]
     nearest: dict[int, tuple[float, int]] = {}
@@ -70,7 +70,7 @@ def nearest_in_time(a: Sequence[Photo], b: Sequence[Photo], most_s: float) -> li
     return sorted(((i, j) for i, (_, j) in nearest.items()), key=lambda pair: pair[1])
 
 
-def _clocks(photos: Sequence[Photo]) -> NDArray[np.float64]:
+def clocks(photos: Sequence[Photo]) -> NDArray[np.float64]:
     """(n,) times in s by the photos' own clocks, whatever their zones; NaN where there is none."""
     return np.array(
         [np.nan if p.time is None else p.time.replace(tzinfo=UTC).timestamp() for p in photos],

@@ -18,7 +18,7 @@ from skyquilt.model.photo import Photo
 from skyquilt.photos.position_tables import has_header
 from skyquilt.photos.side_rows import SideRow, sentence_of
 from skyquilt.video.positions import METRES_PER_DEGREE, places_at, position_at
-from skyquilt.video.tracks import is_timed_csv, read_track
+from skyquilt.video.tracks import is_timed_csv, read_track, unix_s
 
 Array = NDArray[np.float64]
 ZONES_H = np.arange(-12, 14.01, 0.25)
@@ -78,7 +78,7 @@ def read_track_rows(
             f"{path.name} holds positions by time, and no photo tells when it was taken. Give a CSV"
             " with the names of the photos."
         )
-    taken = np.array([_seconds(p.time) for p in timed])
+    taken = np.array([unix_s(p.time) for p in timed])
     zoned = all(p.time is not None and p.time.tzinfo is not None for p in timed)
     fits = [_fit(track, taken, o) for o in _offsets(clock_offset_s, zoned=zoned)]
     best = max(fits, key=lambda f: (*f.rank, -_from_sun(f, track)))
@@ -105,12 +105,6 @@ def read_track_rows(
             )
         )
     return tuple(rows), tuple(_notes(path.name, best, fits, timed, clock_offset_s, zoned=zoned))
-
-
-def _seconds(time: datetime | None) -> float:
-    """Seconds since 1970; a time without zone counts as UTC."""
-    assert time is not None
-    return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
 
 
 def _offsets(told: float | None, *, zoned: bool) -> Array:

@@ -150,6 +150,13 @@ def _asset(name: str) -> Markup:
 _BEGIN, _END = "<!-- other spectrum -->", "<!-- /other spectrum -->"
 
 
+def add_section(output: Path, section: Section) -> None:
+    """Adds a section to the report of a finished run, if it has one; a former one is replaced."""
+    page = output / "report.html"
+    if page.is_file():
+        write_page(page, with_section(page.read_text(encoding="utf-8"), section))
+
+
 def with_section(page: str, section: Section) -> str:
     """A finished report with this section at its end; a former one is replaced."""
     body = f"{_BEGIN}\n{section_html(section)}\n{_END}"

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyquilt.coregistration.pictures import guess_of, open_picture
 from skyquilt.coregistration.rig import FindRig, Rig, RigPair
@@ -26,13 +25,13 @@ from skyquilt.ortho.compose import Composer
 from skyquilt.ortho.exposure import NEUTRAL, Exposure
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.radiometry import DriftMethod, balances_drift, drift_of, value_tags
-from skyquilt.photos.pixels import lost, read_color
+from skyquilt.photos.pixels import read_color
 from skyquilt.photos.read import rejected
 from skyquilt.photos.together import taken_together
 from skyquilt.raster import CogWriter, RasterSpec
 from skyquilt.settings import PictureSettings
 from skyquilt.workflows.flow import Scene
-from skyquilt.workflows.photo_features import THUMBNAIL
+from skyquilt.workflows.photo_features import THUMBNAIL, pixels_again
 
 MOST_PAIRS = 12
 """Largest number of pairs registered, distributed over the flight; each takes one or two
@@ -126,19 +125,6 @@ def _undecodable(photo: Photo) -> RejectedPhoto | None:
     return None
 
 
-def _pixels(photo: Photo) -> NDArray[Any]:
-    """Pixels of a frame that could be decoded before.
-
-    Raises:
-        PhotoFailedError: it cannot be any more.
-    """
-    try:
-        return read_color(photo)
-    except Exception as error:
-        reason = lost(photo) or rejected(photo.name, error).reason
-        raise PhotoFailedError(photo.name, reason) from error
-
-
 def _freedom(photo: Photo) -> float:
     """Relative uncertainty of the focal length: three standard deviations."""
     if photo.calibration is not None or photo.focal.sigma_px < KNOWN_FOCAL * photo.focal.px:
@@ -180,7 +166,7 @@ def drift_of_rigged(
     if not balances_drift(settings, unit):
         return NEUTRAL
     views = _views(found, ground)
-    frames = {v.photo: shrink(_pixels(found.photos[v.photo]), THUMBNAIL)[0] for v in views}
+    frames = {v.photo: shrink(pixels_again(found.photos[v.photo]), THUMBNAIL)[0] for v in views}
     return drift_of(views, frames, ground.surface, ground.grid.bounds, unit, drift, settings)
 
 
@@ -202,7 +188,7 @@ def draw_rigged(
         views=_views(found, scene.ground),
         surface=scene.ground.surface,
         blend=blend,
-        pixels=lambda i: _pixels(found.photos[i]),
+        pixels=lambda i: pixels_again(found.photos[i]),
         bands=first.channels,
         dtype=kind,
         exposure=exposure,

@@ -2,7 +2,6 @@
 the report.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,11 +14,11 @@ from numpy.typing import NDArray
 from skyquilt.coregistration.page import picture
 from skyquilt.coregistration.pictures import Source
 from skyquilt.ortho.companions import coloured
-from skyquilt.raster.atomic import whole_file, write_text
+from skyquilt.raster.atomic import whole_file
 from skyquilt.report.images import shrunk
 from skyquilt.report.layers import value_legend
 from skyquilt.report.numbers import DASH, fixed, mapping, number, plain
-from skyquilt.report.page import with_section, write_page
+from skyquilt.report.page import add_section
 from skyquilt.report.parts import UNITS, Block, Section, Sentences, Table
 
 OVERLAYS = ("thermal_checkerboard.png", "thermal_false_colour.png", "thermal_alpha.png")
@@ -35,22 +34,12 @@ def write_overlays(output: Path, pictures: Sequence[NDArray[np.uint8]]) -> None:
             file.write(data.tobytes())
 
 
-def write_figures(output: Path, visual: Mapping[str, Any], figures: Mapping[str, Any]) -> None:
-    """Writes metrics.json of the visual map, with the registration of the thermal map under
-    `thermal`.
-    """
-    write_text(
-        output / "metrics.json", json.dumps({**visual, **figures}, indent=1, allow_nan=False)
-    )
-
-
 def write_section(
     output: Path, thermal: Source, pictures: Sequence[NDArray[np.uint8]], record: Mapping[str, Any]
 ) -> None:
     """Adds the thermal map with its overlays (`coregistration.files.OVERLAYS`) and figures to the
     report of the visual map.
     """
-    page = output / "report.html"
     values = thermal.picture.values
     seen = np.isfinite(values) if values.ndim == 2 else np.ones(values.shape[:2], bool)
     seen = seen if thermal.picture.valid is None else seen & thermal.picture.valid
@@ -58,8 +47,7 @@ def write_section(
     flat = np.where(seen, values, 0) if values.ndim == 2 else values
     rgb = coloured(flat.reshape(*seen.shape, -1), seen.astype(np.uint8) * np.uint8(255))[..., :3]
     section = thermal_section(record, [rgb, *pictures[1:]], (float(low), float(high)))
-    if page.is_file():
-        write_page(page, with_section(page.read_text(encoding="utf-8"), section))
+    add_section(output, section)
 
 
 LONGEST = 1000

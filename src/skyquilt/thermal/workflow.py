@@ -36,11 +36,12 @@ from skyquilt.settings import DEFAULTS, MosaicSettings, PictureSettings
 from skyquilt.thermal.by_heights import finer
 from skyquilt.thermal.by_pairs import by_homographies, by_pairs
 from skyquilt.thermal.by_rig import draw_rigged, drift_of_rigged, rig_figures, rigged
-from skyquilt.thermal.page import write_figures, write_overlays, write_section
+from skyquilt.thermal.page import write_overlays, write_section
 from skyquilt.thermal.routes import ROUTES, Joined, as_registration, join, opened, refuse_apart
 from skyquilt.typed import as_path, instance
 from skyquilt.workflows.flow import Scene
 from skyquilt.workflows.mosaic import FinishedMap, make_map
+from skyquilt.workflows.run_report import write_figures
 from skyquilt.workflows.survey_input import SurveyInput, read_input
 
 FOLDER = "thermal"
@@ -262,7 +263,7 @@ def _leave(
     """Writes the overlays, the report's section, and finally the figures."""
     write_overlays(output, pictures)
     write_section(output, opened(output / "thermal.tif"), pictures, figures["thermal"])
-    write_figures(output, visual, figures)
+    write_figures(output, {**visual, **figures})
 
 
 def _figures(joined: Joined, heat: Result, b: Source) -> dict[str, Any]:

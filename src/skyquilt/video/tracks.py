@@ -118,7 +118,7 @@ def _read_srt(path: Path) -> Track:
     start = None
     if first is not None and moment is not None:
         # not `fromtimestamp`: Windows knows no time before 1970, as of a clock that was never set
-        start = datetime(1970, 1, 1) + timedelta(seconds=_unix(moment) - timed[first])
+        start = datetime(1970, 1, 1) + timedelta(seconds=unix_s(moment) - timed[first])
     decimals = max((s.decimals for s in samples), default=0)
     focal = [s.focal_35mm for s in samples if s.focal_35mm]
     zoom = [s.zoom for s in samples if s.zoom]
@@ -148,12 +148,12 @@ def _clip_times(samples: Sequence[Sample]) -> list[float]:
         return [s.start_s or 0.0 for s in samples]
     moments = [s.moment for s in samples]
     if all(m is not None for m in moments):
-        first = _unix(moments[0])
-        return [_unix(m) - first for m in moments]
+        first = unix_s(moments[0])
+        return [unix_s(m) - first for m in moments]
     return [float(s.index - samples[0].index) for s in samples]
 
 
-def _unix(moment: datetime | None) -> float:
+def unix_s(moment: datetime | None) -> float:
     """Seconds since 1970 of a time; a time without zone counts as UTC."""
     assert moment is not None
     return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
@@ -313,7 +313,7 @@ def _cell_time(text: str, *, milli: bool) -> float | None:
 def _parsed_time(text: str) -> float | None:
     """Seconds since 1970 of an ISO 8601 time; without a zone it counts as UTC."""
     try:
-        return _unix(datetime.fromisoformat(text.replace("Z", "+00:00").replace("/", "-")))
+        return unix_s(datetime.fromisoformat(text.replace("Z", "+00:00").replace("/", "-")))
     except ValueError:
         return None
 

@@ -239,6 +239,19 @@ def pixels_of(photo: Photo, store: Store) -> NDArray[Any]:
     return decode_jpeg(body.tobytes())
 
 
+def pixels_again(photo: Photo) -> NDArray[Any]:
+    """Pixels of a photo that could be decoded before.
+
+    Raises:
+        PhotoFailedError: it cannot be any more.
+    """
+    try:
+        return read_color(photo)
+    except Exception as error:  # whatever it is, it concerns this photo alone
+        reason = lost(photo) or rejected(photo.name, error).reason
+        raise PhotoFailedError(photo.name, reason) from error
+
+
 def features_key(photo: Photo, detector: Detector) -> str:
     """The key of a photo's features and thumbnail in the store."""
     return digest(photo.pixels_key, features_recipe(detector))

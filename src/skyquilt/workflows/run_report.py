@@ -79,7 +79,7 @@ def finish_run(
     write_report(output / "report.html", page)
     yield 2, 3
     metrics |= _times(clock)
-    write_text(output / "metrics.json", json.dumps(metrics, indent=1, allow_nan=False))
+    write_figures(output, metrics)
     if not alignment.frame.crs:
         yield Note(
             text="the map is not georeferenced: the photos carry no usable positions", warning=True
@@ -267,3 +267,8 @@ def _times(clock: Clock) -> dict[str, Any]:
         "peak_memory_mb_of_stage": dict(clock.peak_mb),
         "peak_memory_mb": None if memory is None else round(memory, 1),
     }
+
+
+def write_figures(output: Path, metrics: Mapping[str, Any]) -> None:
+    """Writes metrics.json."""
+    write_text(output / "metrics.json", json.dumps(metrics, indent=1, allow_nan=False))
