@@ -28,7 +28,8 @@ from tests.alignment.blocks import (
 
 def unknowns_error(block, state):
     """(6n + 10m) errors in the order of the reduced system."""
-    rotation = attitude_error(state.R, block.truth.R)
+    turned = attitude_error(state.R, block.truth.R)
+    rotation = np.einsum("nij,nj->ni", block.truth.R, turned)  # about the camera's axes
     photos = np.concatenate([rotation, state.C - block.truth.C], 1)
     return np.concatenate([photos.ravel(), (state.K - block.truth.K).ravel()])
 
@@ -73,7 +74,11 @@ def dense_system(problem, state):
             np.where(np.isnan(problem.X0), 0, 1 / problem.sigma_X**2).ravel(),
         ]
     )
-    return A.T @ A + np.diag(prior_w), A.T @ e + prior_w * np.nan_to_num(prior_e)
+    about = np.eye(len(prior_w))  # priors on attitudes count about the map's axes
+    for i in range(n):
+        about[6 * i : 6 * i + 3, 6 * i : 6 * i + 3] = problem.R0[i].T
+    prior_g = about.T @ (prior_w * np.nan_to_num(prior_e))
+    return A.T @ A + about.T @ np.diag(prior_w) @ about, A.T @ e + prior_g
 
 
 @pytest.fixture(scope="module", params=["free", "fixed"])

@@ -10,9 +10,10 @@ from pyproj import Transformer
 from skyquilt.alignment.aligners import blank_notes, choose_method
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.control import Control, control_in_frame, fit_similarity_3d
+from skyquilt.alignment.deviations import drift, position_noise
 from skyquilt.alignment.problem import READOUT
 from skyquilt.alignment.setup import HALF_TURN
-from skyquilt.alignment.stages import position_noise, prune
+from skyquilt.alignment.stages import prune
 from skyquilt.engine.codec import decode, encode
 from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.errors import AlignmentError
@@ -325,6 +326,31 @@ def test_position_noise_is_what_neighbours_do_not_share():
     assert position_noise(smooth + rng.normal(0, 1.5, (n, 2))) == pytest.approx(1.5, rel=0.15)
     assert position_noise(smooth[:5]) == 0.0
     assert position_noise(np.full((10, 2), np.nan)) == 0.0
+
+
+def test_drift_is_what_neighbours_share():
+    rng = np.random.default_rng(1)
+    noise = rng.normal(0, 1.5, (400, 1))
+    ramp = np.linspace(-30, 30, 400)[:, None]
+    assert drift(noise) < 0.8
+    assert drift(ramp + noise) == pytest.approx(np.median(np.abs(ramp)) * 1.48, rel=0.1)
+    assert drift(ramp[:5]) == 0.0
+    assert drift(np.full((10, 2), np.nan)) == 0.0
+
+
+def test_heights_that_drift_leave_the_map_as_uncertain(plain):
+    flown, found = plain
+    drifting = Flown(4)
+    off = np.linspace(0, 60, len(drifting.priors))
+    drifting.priors = [
+        replace(p, map_C=p.map_C + (0, 0, z)) for p, z in zip(drifting.priors, off, strict=True)
+    ]
+    again = drifting.aligned()
+    bias = np.mean([again.poses[i].map_C[2] - flown.truth.C[i, 2] for i in again.poses])
+    assert bias == pytest.approx(30, abs=5)
+    assert found.accuracy.shared_m[1] < 3
+    assert abs(bias) / 2 < again.accuracy.shared_m[1] < 2 * abs(bias)
+    assert again.accuracy.shared_m[0] == pytest.approx(found.accuracy.shared_m[0], rel=0.3)
 
 
 def test_pruning_drops_lies_and_lonely_points_but_no_control():

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.linalg import block_diag
 
 from skyquilt.alignment import equations
 from skyquilt.alignment.adjust import adjust
@@ -78,7 +79,9 @@ def test_the_step_of_all_unknowns_solves_the_whole_equations(options):
     H, g = (J * w[:, None]).T @ J, J.T @ (w * lin.residual.ravel())
     priors = prior_terms(problem, state)
     fixed = np.where(problem.free, priors.camera, 1.0)
-    H[np.diag_indices(6 * n + CAMERA * m)] += np.r_[priors.photo[:, :6].ravel(), fixed.ravel()]
+    H[: 6 * n, : 6 * n] += block_diag(*priors.photo[:, :6, :6])
+    own = np.arange(6 * n, 6 * n + CAMERA * m)
+    H[own, own] += fixed.ravel()
     g[: 6 * n] += priors.photo_gradient[:, :6].ravel()
     g[6 * n : 6 * n + CAMERA * m] += priors.camera_gradient.ravel()
     H[np.diag_indices(len(H))] *= 1 + damping

@@ -204,6 +204,42 @@ def test_the_dominant_plane_levels_the_map_whatever_stands_on_it():
         np.testing.assert_allclose(after, before, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("pitch", "lines", "slope", "vertical"),
+    [
+        (0.0, (0, 180, 0), 20.0, True),
+        (0.0, (0, 180, 0), 0.0, True),
+        (25.0, (0, 180, 0), 0.0, False),  # cameras tilted on their drones look two ways
+        (25.0, (0, 0, 0), 0.0, False),  # and so might these on a slope: the ground counts
+    ],
+)
+def test_ground_is_a_slope_where_photos_of_several_headings_look_the_same_way(
+    pitch, lines, slope, vertical
+):
+    rng = np.random.default_rng(4)
+    xyz = hills(2000) * (1, 1, 0.3)
+    xyz[:, 2] += np.tan(np.radians(slope)) * xyz[:, 0]
+    flown = [
+        pose(x, y, z=60 + np.tan(np.radians(slope)) * x, yaw=yaw, pitch=pitch + rng.normal(0, 1))
+        for y, yaw in zip((-30, 0, 30), lines, strict=True)
+        for x in (-40, -20, 0, 20, 40)
+    ]
+    done = block(flown, xyz)
+    Q = rotation_from_vector(np.array([0.3, -0.2, 0.4]))
+    turned = replace(
+        done,
+        poses={
+            i: Pose(cam_R_map=p.cam_R_map @ Q.T, map_C=Q @ p.map_C) for i, p in enumerate(flown)
+        },
+        ties=replace(done.ties, xyz=xyz @ Q.T),
+    )
+    again = levelled(turned)
+    tilts = [tilt_deg(p.cam_R_map) for p in again.poses.values()]
+    assert (np.median(tilts) < 2) == vertical
+    ground = np.degrees(np.arccos(dominant_normal(again.ties.xyz, 1.8)[2]))
+    assert ground == pytest.approx(slope, abs=1.0)
+
+
 def test_a_photo_without_links_is_not_drawn_over_what_others_show():
     """A lens cap in the middle of a survey adds black; at its rim it might be woods or water."""
     done = block(LAWN, hills(3000))

@@ -17,7 +17,7 @@ from skyquilt.alignment.problem import (
     residuals_px,
 )
 from skyquilt.alignment.setup import FISHEYE
-from skyquilt.geometry.frames import rotation_from_vector
+from skyquilt.geometry.frames import cam_R_map_from_angles, rotation_from_vector
 from tests.alignment.blocks import make_block, seen_by
 
 ALL = np.arange(CAMERA) != FISHEYE
@@ -121,13 +121,21 @@ vectors = st.lists(st.floats(-1.8, 1.8), min_size=3, max_size=3).map(np.array)
 @settings(max_examples=150)
 @given(vectors, vectors)
 def test_attitude_error_undoes_a_rotation(w, turn):
-    """exp(w) R0 lies w from R0 (shorter than half a turn), in camera axes whatever R0."""
+    """R0 exp(w) lies w from R0 (shorter than half a turn), in axes of the map whatever R0."""
     if np.linalg.norm(w) > 3.1:
         return
     R0 = rotation_from_vector(turn)
-    assert attitude_error((rotation_from_vector(w) @ R0)[None], R0[None])[0] == pytest.approx(
+    assert attitude_error((R0 @ rotation_from_vector(w))[None], R0[None])[0] == pytest.approx(
         w, abs=1e-7
     )
+
+
+@given(st.floats(-180, 180), st.floats(0, 89), st.floats(-40, 40), st.floats(-90, 90))
+def test_a_compass_that_is_off_makes_no_tilt_wrong(yaw, pitch, roll, off):
+    told = cam_R_map_from_angles(yaw + off, pitch, roll)
+    error = attitude_error(cam_R_map_from_angles(yaw, pitch, roll)[None], told[None])[0]
+    assert np.abs(error[:2]).max() < 1e-9
+    assert abs(error[2]) == pytest.approx(np.radians(abs(off)), abs=1e-9)
 
 
 def test_a_step_of_a_state():

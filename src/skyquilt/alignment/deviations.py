@@ -160,3 +160,25 @@ def believed(problem: Problem, noise: Noise) -> Problem:
     """The problem whose observations weigh what the noise says that they tell."""
     effect = noise.design_effect
     return replace(problem, design_effect=effect, trust=problem.shared / (effect * noise.variance))
+
+
+def position_noise(error: Array) -> float:
+    """Robust deviation in m of each axis of position errors (n, 2), in order of capture, from
+    their neighbours' mean.
+    """
+    known = error[np.isfinite(error).all(1)]
+    if len(known) < 6:
+        return 0.0
+    local = known[1:-1] - (known[:-2] + known[2:]) / 2
+    return float(1.48 * np.median(np.abs(local)) / np.sqrt(1.5))
+
+
+def drift(error: Array) -> float:
+    """Robust deviation in m of what position errors (n, 2), in order of capture, have in common
+    with those before and after: all of it less `position_noise`. Zero for errors of which each is
+    its own, and of fewer than six, which do not tell.
+    """
+    noise = position_noise(error)
+    known = error[np.isfinite(error).all(1)]
+    spread = 1.48 * np.median(np.abs(known)) if noise > 0 else 0.0
+    return float(np.sqrt(max(spread**2 - noise**2, 0.0)))

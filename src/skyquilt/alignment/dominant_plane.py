@@ -1,5 +1,5 @@
-"""The plane that most tie points lie near: the level of a map of photos that report neither
-positions nor angles.
+"""The level of a map of photos that report neither positions nor angles: the plane that most tie
+points lie near, or the vertical that most photos look along.
 """
 
 import numpy as np
@@ -13,6 +13,16 @@ NEAR = 0.03
 """Points within this share of the median flying height are near a plane."""
 TRIES = 400
 """Planes tried, each through three points."""
+SAMPLED = 400
+"""Photos whose axes are compared, about."""
+ALIKE_DEG = 10.0
+"""Photos whose axes differ by less look the same way."""
+TURNED_DEG, TURNED_SHARE = 60.0, 0.2
+"""Photos are headed in several directions if so large a share is headed elsewhere by so much."""
+SLOPING_DEG = 5.0
+"""Ground that is less inclined is level: axes of vertical photos are not known better."""
+SCATTERS = 3.0
+"""Deviations of the axes by which the ground must be inclined as well."""
 
 
 def dominant_normal(xyz: Array, near_m: float) -> Array:
@@ -38,18 +48,52 @@ def dominant_normal(xyz: Array, near_m: float) -> Array:
 
 
 def levelled(alignment: Alignment) -> Alignment:
-    """The alignment turned so that its dominant plane is level; unchanged without tie points."""
+    """The alignment turned so that its dominant plane is level; unchanged without tie points.
+
+    Ground may slope, though: most photos of a flight with a gimbal look straight down. They do if
+    their axes are parallel while they are headed in several directions, since cameras tilted on
+    their drones would look another way on each line. Then their axes are the vertical where the
+    plane lies clearly inclined to them.
+    """
     xyz = alignment.ties.xyz
     if len(xyz) < 3:
         return alignment
     C = np.array([p.map_C for p in alignment.poses.values()])
     normal = dominant_normal(xyz, NEAR * _height(C, xyz))
+    seen = vertical_of(np.array([p.cam_R_map for p in alignment.poses.values()]))
+    if seen is not None:
+        inclined = np.degrees(np.arccos(np.clip(seen[0] @ normal, -1, 1)))
+        if inclined > max(SLOPING_DEG, SCATTERS * seen[1]):
+            normal = seen[0]
     up = np.array([0.0, 0.0, 1.0])
     side = np.cross(normal, up)
     Q = turning(np.array([normal, side, np.cross(normal, side)]), _frame(up, side))
     if np.linalg.norm(side) < 1e-9:
         return alignment
     return alignment.carried(Q, 1.0, np.median(xyz, axis=0))
+
+
+def vertical_of(cam_R_map: Array) -> tuple[Array, float] | None:
+    """The upward vertical (3,) of photos that look straight down, from their rotations (n, 3, 3),
+    and the scatter of their axes about it in degrees; None where most do not look the same way, or
+    all of these are headed alike: such photos may slant.
+    """
+    cam_R_map = cam_R_map[:: max(1, len(cam_R_map) // SAMPLED)]
+    axes = cam_R_map[:, 2]
+    near = axes @ axes.T > np.cos(np.radians(ALIKE_DEG))
+    some = near[int(np.argmax(near.sum(1)))]
+    if 2 * some.sum() <= len(axes):
+        return None
+    down = axes[some].sum(0)
+    down /= np.linalg.norm(down)
+    ahead = -cam_R_map[some, 1]
+    ahead -= (ahead @ down)[:, None] * down
+    ahead /= np.linalg.norm(ahead, axis=1)[:, None]
+    turned = ahead @ ahead.T < np.cos(np.radians(TURNED_DEG))
+    if turned.mean(1).min() < TURNED_SHARE:
+        return None
+    off = np.arccos(np.clip(axes[some] @ down, -1, 1))
+    return -down, float(np.degrees(np.sqrt((off**2).mean())))
 
 
 def _frame(up: Array, side: Array) -> Array:

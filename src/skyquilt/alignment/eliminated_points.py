@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.problem import Problem, State, linearise, linearised_points
-from skyquilt.alignment.robust import observation_weights, observed_cost, point_terms
+from skyquilt.alignment.robust import add_diagonal, observation_weights, observed_cost, point_terms
 from skyquilt.geometry.block_cholesky import Index
 
 Array = NDArray[np.float64]
@@ -103,12 +103,6 @@ def _by_photo(row: Index, count: int, rows: Array) -> Array:
         own = sorted_rows[2 * cuts[i] : 2 * cuts[i + 1]]
         out[i] = own.T @ own
     return out
-
-
-def add_diagonal(blocks: Array, values: Array) -> None:
-    """Adds values (n, k) to the diagonals of blocks (n, k, k)."""
-    k = np.arange(values.shape[1])
-    blocks[:, k, k] += values
 
 
 def observation_equations(problem: Problem, state: State) -> Normal:

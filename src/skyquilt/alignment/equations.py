@@ -12,9 +12,9 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.eliminated_points import Reduced, add_diagonal, moved_points, reduced_part
+from skyquilt.alignment.eliminated_points import Reduced, moved_points, reduced_part
 from skyquilt.alignment.problem import CAMERA, Problem, State
-from skyquilt.alignment.robust import position_terms, prior_terms
+from skyquilt.alignment.robust import add_diagonal, position_terms, prior_terms
 from skyquilt.engine.free_memory import give_back
 from skyquilt.engine.workers import HERE, Workers
 from skyquilt.geometry.block_cholesky import LEAF, Factor, Index, Matrix, distinct, pattern
@@ -213,7 +213,7 @@ class Equations:
             s = p * len(found.seen)
             g[found.seen] += found.gradient[:s].reshape(-1, p)
             gc[: q * m] += found.gradient[s:]
-        add_diagonal(U, priors.photo[:, :p])
+        U += priors.photo[:, :p, :p]
         add_diagonal(Uc, np.where(self.problem.free, priors.camera, 1.0)[:, :q])
         add_diagonal(U, np.diagonal(U, axis1=1, axis2=2) * damping + 1e-9)
         add_diagonal(Uc, np.diagonal(Uc, axis1=1, axis2=2) * damping)

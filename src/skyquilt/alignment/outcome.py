@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.adjust import Covariance
-from skyquilt.alignment.deviations import likeness, point_deviations
+from skyquilt.alignment.deviations import drift, likeness, point_deviations
 from skyquilt.alignment.problem import Problem, State, residuals_px
 from skyquilt.alignment.setup import Setup
 from skyquilt.alignment.stages import heights_above, prune
@@ -125,14 +125,23 @@ def accuracy(setup: Setup, problem: Problem, state: State, covariance: Covarianc
     if told.any():
         sample, sigma = sample[told], sigma[told]
     tied = bool(np.isfinite(problem.X0).any())
-    stated = np.median(setup.stated_sigma_C, axis=0)
     return Accuracy(
         xyz=state.X[sample],
         sigma_m=sigma,
-        shared_m=(0.0, 0.0) if tied else (float(stated[0]), float(stated[2])),
+        shared_m=(0.0, 0.0) if tied else _shared(setup, problem, state),
         focal_share=_focal_share(problem, covariance),
         design_effect=problem.design_effect,
     )
+
+
+def _shared(setup: Setup, problem: Problem, state: State) -> tuple[float, float]:
+    """Horizontal and vertical deviation in m of all positions alike: the stated one, or what errors
+    of positions one after the other have in common. An instrument that drifts over a flight is as
+    far off at its start as it may drift, and their mean tells nothing of it.
+    """
+    stated = np.median(setup.stated_sigma_C, axis=0)
+    error = state.C - problem.C0
+    return (max(float(stated[0]), drift(error[:, :2])), max(float(stated[2]), drift(error[:, 2:])))
 
 
 def _focal_share(problem: Problem, covariance: Covariance) -> float:

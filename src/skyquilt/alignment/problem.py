@@ -97,7 +97,9 @@ class Problem:
     R0: Array
     """(n, 3, 3) measured attitudes, map to camera."""
     sigma_R: Array
-    """(n, 3) deviations in rad about the camera's x, y, z axes; infinite where unknown."""
+    """(n, 3) deviations in rad about the map's x, y, z axes; infinite where unknown. A compass
+    errs about the vertical, and what tells the tilt errs about level axes, wherever a camera looks.
+    """
     X0: Array
     """(P, 3) surveyed coordinates of control points; NaN for tie points and unknown axes."""
     sigma_X: Array
@@ -394,7 +396,9 @@ def _residuals(problem: Problem, state: State) -> Iterator[tuple[slice, Array]]:
 
 
 def attitude_error(R: Array, R0: Array) -> Array:
-    """Rotation vectors (n, 3) in rad, in camera axes, that take R0 to R."""
+    """Rotation vectors (n, 3) in rad, in axes of the map, that take R0 to R (rotations from map to
+    camera).
+    """
     E = R @ np.swapaxes(R0, -1, -2)
     v = (
         np.stack([E[:, 2, 1] - E[:, 1, 2], E[:, 0, 2] - E[:, 2, 0], E[:, 1, 0] - E[:, 0, 1]], -1)
@@ -403,4 +407,4 @@ def attitude_error(R: Array, R0: Array) -> Array:
     sine = np.linalg.norm(v, axis=-1)
     angle = np.arctan2(sine, (np.trace(E, axis1=1, axis2=2) - 1) / 2)
     scale = np.where(sine > 1e-9, angle / np.maximum(sine, 1e-12), 1.0)
-    return np.asarray(v * scale[:, None])
+    return np.asarray((v * scale[:, None])[:, None] @ R0)[:, 0]

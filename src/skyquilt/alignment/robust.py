@@ -10,6 +10,12 @@ from skyquilt.alignment.problem import Problem, State, attitude_error, residuals
 Array = NDArray[np.float64]
 
 
+def add_diagonal(blocks: Array, values: Array) -> None:
+    """Adds values (n, k) to the diagonals of blocks (n, k, k)."""
+    k = np.arange(values.shape[1])
+    blocks[:, k, k] += values
+
+
 def _cauchy(squared: Array, scale: float) -> tuple[Array, Array]:
     """Weights and costs of squared whitened residuals under Cauchy's loss."""
     u = squared / scale**2
@@ -39,7 +45,7 @@ class PriorTerms:
     """Precisions and gradients (residual times precision) of the priors on photos and cameras."""
 
     photo: Array
-    """(n, 9) precisions of rotations, centres and turns."""
+    """(n, 9, 9) precisions of rotations (about the camera's axes), centres and turns."""
     photo_gradient: Array
     """(n, 9)."""
     camera: Array
@@ -55,15 +61,20 @@ def prior_terms(problem: Problem, state: State) -> PriorTerms:
     dc, pc, cost_c = position_terms(problem, state)
     rotation = attitude_error(state.R, problem.R0)
     wr, cost_r = _pseudo_huber(((rotation / problem.sigma_R) ** 2).sum(1), problem.loss_R)
-    pr = wr[:, None] / problem.sigma_R**2
+    pr = wr[:, None] / problem.sigma_R**2  # about the map's axes
     pk, dk = problem.free / problem.sigma_K**2, state.K - problem.K0
     pt = np.zeros_like(state.turn)
     if problem.sigma_turn is not None:
         pt += 1 / problem.sigma_turn[:, None] ** 2
     cost = cost_c.sum() + cost_r.sum() + (pk * dk**2).sum() + (pt * state.turn**2).sum()
+    R0, R0_T = problem.R0, np.swapaxes(problem.R0, 1, 2)
+    photo = np.zeros((len(pr), 9, 9))
+    photo[:, :3, :3] = (R0 * pr[:, None]) @ R0_T
+    add_diagonal(photo[:, 3:, 3:], np.concatenate([pc, pt], 1))
+    turning = ((pr * rotation)[:, None] @ R0_T)[:, 0]
     return PriorTerms(
-        photo=np.concatenate([pr, pc, pt], 1),
-        photo_gradient=np.concatenate([pr * rotation, pc * dc, pt * state.turn], 1),
+        photo=photo,
+        photo_gradient=np.concatenate([turning, pc * dc, pt * state.turn], 1),
         camera=pk,
         camera_gradient=pk * dk,
         cost=float(cost),

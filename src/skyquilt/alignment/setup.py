@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.motion import velocities
 from skyquilt.alignment.problem import PART, READOUT, Problem, State
-from skyquilt.alignment.start import GROSS_DEG, Start, steered
+from skyquilt.alignment.start import GROSS_DEG, UNKNOWN_YAW_DEG, Start, steered
 from skyquilt.alignment.tracks import Tracks
 from skyquilt.alignment.triangulate import intersect
 from skyquilt.geometry.camera import tangent_over_angle
@@ -38,8 +38,6 @@ UNKNOWN_HEIGHT = 0.5
 """Deviation of heights that are not known, as a share of that of the start, which takes the ground
 for level: on a mountain side it tilts photos that weigh it more than their own tilts.
 """
-UNKNOWN_YAW_DEG = 90.0
-"""Deviation of a heading that is not known; that of the start stands for it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

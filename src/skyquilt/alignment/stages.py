@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.adjust import adjust
-from skyquilt.alignment.deviations import believed, observed_noise, robust_scale
+from skyquilt.alignment.deviations import believed, observed_noise, position_noise, robust_scale
 from skyquilt.alignment.equations import NearFactor
 from skyquilt.alignment.problem import (
     READOUT,
@@ -23,7 +23,8 @@ from skyquilt.alignment.problem import (
 )
 from skyquilt.alignment.robust import position_terms, prior_terms, robust_cost
 from skyquilt.alignment.same_place import shares
-from skyquilt.alignment.setup import UNKNOWN_YAW_DEG, Setup
+from skyquilt.alignment.setup import Setup
+from skyquilt.alignment.start import UNKNOWN_YAW_DEG
 from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.geometry.frames import rotation_from_vector
 
@@ -407,14 +408,3 @@ def _wanted(
         turn = rotation_from_vector(np.asarray(step[None, :3], np.float64))[0] @ turn
         scale, new = scale * float(np.exp(step[3])), new + step[4:] * reach
     return scale, turn, old, new
-
-
-def position_noise(error: Array) -> float:
-    """Robust deviation in m of each axis of position errors (n, 2), in order of capture, from
-    their neighbours' mean.
-    """
-    known = error[np.isfinite(error).all(1)]
-    if len(known) < 6:
-        return 0.0
-    local = known[1:-1] - (known[:-2] + known[2:]) / 2
-    return float(1.48 * np.median(np.abs(local)) / np.sqrt(1.5))
