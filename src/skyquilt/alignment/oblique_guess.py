@@ -22,8 +22,8 @@ from skyquilt.model.poses import Alignment, Prior
 
 Array = NDArray[np.float64]
 OFF = 1.3
-"""An oblique survey whose photos lie further from their positions than this times their deviations
-in space (median; two thirds are usual) may have been begun wrongly;
+"""Photos without camera angles that lie further from their positions than this times their
+deviations in space (median; two thirds are usual) may have been begun wrongly;
 """
 LOST = 0.2
 """so may one that lost more than this share of its linked photos."""
@@ -65,11 +65,12 @@ class _Rays:
 
 
 def misled(found: Alignment, priors: Sequence[Prior], linked: int) -> bool:
-    """Whether an adjustment of `linked` photos, oblique or without camera angles, shows that it was
-    begun wrongly: far from positions, photos lost, or photos turned far.
+    """Whether an adjustment of `linked` photos may have been begun wrongly: those of an oblique
+    survey as they tell, since some fit false headings, too; others without camera angles that lie
+    far from positions, were lost or turned far.
     """
-    if tilts_reported(priors) and not slanting(priors):
-        return False
+    if tilts_reported(priors):
+        return slanting(priors)
     lost = len(found.held) < (1 - LOST) * linked
     return lost or far_off(found, priors) or turned_far(found, priors)
 

@@ -241,11 +241,17 @@ def steered(
     photos: Sequence[Photo], priors: Sequence[Prior], start: Start, yaw_deg: Mapping[int, float]
 ) -> list[Prior]:
     """The priors, their headings such that all those of one camera and block together count as one
-    in the direction of the block: their errors are common. A gross common error from the start's
-    direction (`yaw_deg` of each photo) is taken away, and with it what they tell of the direction.
+    in the direction of the block, as far as positions tell that better: their errors are common.
+    A gross common error from the start's direction (`yaw_deg` of each photo) is taken away, and
+    with it what they tell of the direction.
     """
     out = list(priors)
     for block in start.blocks:
+        told = [m for m in block if m in start.georeferenced]
+        loose = _direction_deg(
+            np.array([priors[m].map_C[:2] for m in told]).reshape(-1, 2),
+            np.array([priors[m].sigma_C[0] for m in told]),
+        )
         for key in dict.fromkeys(photos[m].camera_key for m in block):
             own = [m for m in block if photos[m].camera_key == key]
             headed = [m for m in own if np.isfinite(priors[m].yaw_deg)]
@@ -254,7 +260,8 @@ def steered(
             false = abs(common) > GROSS_DEG
             for m in headed:
                 told_deg = priors[m].sigma_yaw_deg
-                looser = told_deg * np.sqrt(len(headed))
+                share = max(0.0, 1 - (loose / told_deg) ** 2)
+                looser = told_deg * np.sqrt(1 + share * (len(headed) - 1))
                 sigma_deg = max(told_deg, min(looser, LOOSEST_DEG))
                 out[m] = replace(
                     priors[m],
@@ -282,3 +289,16 @@ def common_error_deg(off_deg: NDArray[np.float64], whole: Sequence[bool]) -> flo
     about = angle_difference_deg(off[near[best]], off[best])
     angle = angle_difference_deg(float(off[best]), -float(np.median(about)))
     return 0.0 if off is off_deg and not all(whole) and abs(angle) > 180 - ALIKE_DEG else angle
+
+
+def _direction_deg(C: NDArray[np.float64], sigma_m: NDArray[np.float64]) -> float:
+    """Deviation in degrees of the direction that positions C (n, 2) in m of deviations (n,) tell;
+    those that are not known are NaN.
+    """
+    known = np.isfinite(C).all(1)
+    if not known.any():
+        return np.inf
+    weight = sigma_m[known] ** -2
+    reach = C[known] - np.average(C[known], axis=0, weights=weight)
+    tells = float((weight * (reach**2).sum(1)).sum())
+    return float(np.degrees(1 / np.sqrt(max(tells, 1e-12))))
