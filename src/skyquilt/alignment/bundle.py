@@ -17,7 +17,7 @@ from skyquilt.alignment.motion import speeds_of
 from skyquilt.alignment.near_positions import told_besides
 from skyquilt.alignment.oblique import found_oblique, hung, tilts_reported
 from skyquilt.alignment.oblique_guess import LOWERED, guessed_priors, lowered
-from skyquilt.alignment.oblique_start import reported_start, slanting
+from skyquilt.alignment.oblique_start import NO_BEGINNINGS, beginnings, reported_start, slanting
 from skyquilt.alignment.outcome import accuracy, ground_points, leave_one_out, misfits, undetermined
 from skyquilt.alignment.problem import Problem, State
 from skyquilt.alignment.repairs import Beginning, Survey, Tried, begun_with, repaired
@@ -129,6 +129,7 @@ class Bundle:
             adjust=adjust,
             unfit=lambda t: unfit_cameras(t.found, priors_of(t)),
             cut=lambda t: cut_cameras(t.found, priors_of(t)),
+            beginnings=lambda t: beginnings(t.found, photos, t.begun.priors),
             guess=guess,
         )
         tried = begun_with(priors, survey, repair=self.repair)
@@ -148,7 +149,7 @@ class Bundle:
 
     def _in_space(self, begun: Beginning) -> bool:
         """Whether the start takes what photos report for their poses."""
-        return self.repair and (begun.in_space or slanting(begun.told))
+        return self.repair and (begun.in_space is not None or slanting(begun.told))
 
     def _begun(
         self,
@@ -167,7 +168,8 @@ class Bundle:
         features = [f.places for f in features]  # read once, though used many times
         start, ground, priors = None, ground_of(frame), begun.told
         if self._in_space(begun):
-            start = reported_start(photos, priors, features, links, ground)
+            else_at = begun.in_space or NO_BEGINNINGS
+            start = reported_start(photos, priors, features, links, ground, else_at)
         if start is None:
             start = _kept_start(photos, priors, features, links, ground, keep)
         if not start.blocks:

@@ -75,10 +75,10 @@ def misled(found: Alignment, priors: Sequence[Prior], linked: int) -> bool:
     return lost or far_off(found, priors) or turned_far(found, priors)
 
 
-def far_off(found: Alignment, priors: Sequence[Prior]) -> bool:
-    """Whether photos lie further from their positions than these may err."""
+def far_off(found: Alignment, priors: Sequence[Prior], times: float = OFF) -> bool:
+    """Whether photos lie further from their positions than so many deviations of these (median)."""
     sigma = np.median([float(np.linalg.norm(priors[i].sigma_C)) for i in found.held] or [np.inf])
-    return bool(off_positions(found, priors) > OFF * sigma)
+    return bool(off_positions(found, priors) > times * sigma)
 
 
 def agrees(guessed: Alignment, found: Alignment) -> bool:

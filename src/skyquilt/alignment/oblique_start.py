@@ -5,8 +5,8 @@ dome. Where most photos report their tilt and their place, these are near enough
 an adjustment in space to begin with.
 """
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,16 +14,20 @@ from numpy.typing import NDArray
 from skyquilt.alignment.determined import STATED_DEG
 from skyquilt.alignment.oblique import MOST_OBLIQUE, OBLIQUE_DEG, tilt_deg, tilted, tilts_reported
 from skyquilt.alignment.similarity_graph import components
-from skyquilt.alignment.start import Start, plane_link
+from skyquilt.alignment.start import GROSS_DEG, Start, common_error_deg, plane_link
 from skyquilt.alignment.triangulate import intersect
-from skyquilt.geometry.frames import angles_from_cam_R_map, cam_R_map_from_angles
+from skyquilt.geometry.frames import (
+    angle_difference_deg,
+    angles_from_cam_R_map,
+    cam_R_map_from_angles,
+)
 from skyquilt.matching.lens_kind import as_pinhole
 from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, Prior
 
 Array = NDArray[np.float64]
-ASLANT_DEG = 10.0
+ASLANT_DEG = 5.0
 """Photos tilted by more than this (median) show that their links are no similarities."""
 APART = np.sin(np.radians(5.0))
 """Sine of the least angle between two rays that tell where they meet, positions erring by metres.
@@ -32,6 +36,8 @@ VERTICAL_DEG, LEVEL_SHARE = 15.0, 0.1
 """Photos tilted by less look straight down; with fewer of them a survey has none to speak of."""
 FROM_ABOVE_DEG = 40.0
 """View angle up to which a map shows ground and roofs rather than walls, about."""
+NEIGHBOURS = 3
+"""Photos by which one begins that reports no position."""
 NEARER = 0.95
 """Photos come nearer to their positions where their distance falls by this factor."""
 LOST = 0.8
@@ -42,6 +48,57 @@ CROWDED = 5.0
 """... half of them lie within so many of their deviations of their middle."""
 FEWEST_MET = 50
 """Fewest such pairs of rays that tell the height of the ground."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Beginnings:
+    """Where photos begin in space of which metadata do not tell it, or tell it falsely."""
+
+    centres: Mapping[int, Array]
+    """Photo -> (3,) centre in m."""
+    yaw_deg: Mapping[int, float]
+    """Photo -> heading in degrees."""
+
+    def of(self, photo: int, prior: Prior) -> Prior:
+        """The prior of a photo with its beginning."""
+        return replace(
+            prior,
+            map_C=self.centres.get(photo, prior.map_C),
+            yaw_deg=self.yaw_deg.get(photo, prior.yaw_deg),
+        )
+
+
+NO_BEGINNINGS = Beginnings(centres={}, yaw_deg={})
+"""All photos begin as they report."""
+
+
+def beginnings(found: Alignment, photos: Sequence[Photo], priors: Sequence[Prior]) -> Beginnings:
+    """Headings of compasses that are grossly off, and centres of photos that report their angles
+    but no position, by an adjustment: it may be off, but hardly so from one photo to the next.
+    """
+    held = [i for i in found.held if told(priors[i])]
+    off = {
+        i: angle_difference_deg(
+            priors[i].yaw_deg, angles_from_cam_R_map(found.poses[i].cam_R_map)[0]
+        )
+        for i in held
+    }
+    yaw_deg: dict[int, float] = {}
+    for key in dict.fromkeys(photos[i].camera_key for i in held):
+        own = [i for i in held if photos[i].camera_key == key]
+        whole = [photos[i].editor is None for i in own]
+        common = common_error_deg(np.array([off[i] for i in own]), whole)
+        if abs(common) > GROSS_DEG:
+            yaw_deg |= {i: priors[i].yaw_deg - common for i in own}
+    centres: dict[int, Array] = {}
+    C = np.array([found.poses[i].map_C for i in held]).reshape(-1, 3)
+    apart = np.array([priors[i].map_C for i in held]).reshape(-1, 3) - C
+    for i in found.held:
+        if held and not told(priors[i]) and tells_angles(priors[i]):
+            here = found.poses[i].map_C
+            near = np.argsort(np.linalg.norm(C - here, axis=1))[:NEIGHBOURS]
+            centres[i] = here + apart[near].mean(0)
+    return Beginnings(centres=centres, yaw_deg=yaw_deg)
 
 
 def slanting(priors: Sequence[Prior]) -> bool:
@@ -60,9 +117,12 @@ def aslant(priors: Sequence[Prior]) -> bool:
 
 def told(prior: Prior) -> bool:
     """Whether metadata tell a photo's whole pose."""
-    return bool(
-        np.isfinite([*prior.map_C, prior.yaw_deg]).all() and prior.sigma_tilt_deg <= STATED_DEG
-    )
+    return bool(np.isfinite(prior.map_C).all()) and tells_angles(prior)
+
+
+def tells_angles(prior: Prior) -> bool:
+    """Whether metadata tell a photo's attitude."""
+    return bool(np.isfinite(prior.yaw_deg)) and prior.sigma_tilt_deg <= STATED_DEG
 
 
 def untold(priors: Sequence[Prior]) -> frozenset[int]:
@@ -146,11 +206,14 @@ def reported_start(
     features: Sequence[Features],
     links: Sequence[Link],
     ground_m: float = np.nan,
+    begun: Beginnings = NO_BEGINNINGS,
 ) -> Start | None:
-    """The start with linked photos where their metadata put them, photos that do not tell their
-    pose left out. Where the rays of these do not tell the height of the ground, since all were
-    taken from one place, it is taken for `ground_m`; None if that is not known either.
+    """The start with linked photos where their metadata put them or, as far as these tell nothing,
+    false headings or no position, `begun` does; photos whose pose is not known are left out. Where
+    the rays of these do not tell the height of the ground, since all were taken from one place, it
+    is taken for `ground_m`; None if that is not known either.
     """
+    priors = [begun.of(i, p) for i, p in enumerate(priors)]
     links = tuple(k for k in links if told(priors[k.a]) and told(priors[k.b]))
     plane = [plane_link(k, photos, features) for k in links]
     groups = [g.tolist() for g in components(len(photos), plane) if len(g) > 1]

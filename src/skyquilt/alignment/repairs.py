@@ -17,6 +17,7 @@ from skyquilt.alignment.motion import Speeds
 from skyquilt.alignment.oblique import reported_oblique, without_photos
 from skyquilt.alignment.oblique_guess import agrees, far_off, lowered, misled
 from skyquilt.alignment.oblique_start import (
+    Beginnings,
     aslant,
     nearer,
     off_positions,
@@ -31,6 +32,10 @@ from skyquilt.model.poses import Alignment, MapFrame, Prior
 ENLARGED_AGAIN = 3
 """Photos that are enlarged by other factors are divided so often at most: what fits none of the
 cameras bends the heights by which the next are told.
+"""
+AWAY = 1.0
+"""Photos that tell their poses, and lie further from their positions than this times their
+deviations in space (median; two thirds are usual), may have been begun wrongly.
 """
 BEGUN_AGAIN = 5
 """An oblique survey without camera angles is adjusted again as it was found, so often at most, as
@@ -54,8 +59,10 @@ class Beginning:
     """Cameras whose shutters and aspect ratios pictures alone tell."""
     cut: frozenset[str] = frozenset()
     """Cameras whose principal points pictures alone tell."""
-    in_space: bool = False
-    """Photos begin where they report to be, as those of an oblique survey do."""
+    in_space: Beginnings | None = None
+    """Photos begin where they report to be, as those of an oblique survey do, or else here; None:
+    where links of photos that look down put them.
+    """
     name: str = ""
     """Tells parts of this adjustment that are kept from those of others."""
 
@@ -93,6 +100,8 @@ class Survey:
     """Names of cameras that photos contradict (`unfit_cameras`)."""
     cut: Callable[[Tried], frozenset[str]]
     """Names of those whose photos may have been cut off (`cut_cameras`)."""
+    beginnings: Callable[[Tried], Beginnings]
+    """Where photos begin in space (`oblique_start.beginnings`)."""
     guess: Callable[[Beginning], Sequence[Prior] | None]
     """Priors with directions with which matched rays meet clearly better; None without any."""
 
@@ -129,13 +138,14 @@ def repaired(first: Tried, survey: Survey) -> Tried:
 def _as_reported(last: Tried, survey: Survey) -> Tried:
     """Photos that look somewhat aslant begin as they report: links of these, taken for similarities
     of the ground's plane, may put them where positions look like gross errors. Photos that do not
-    report their pose are hung on the others.
+    report their angles are hung on the others.
     """
     priors = last.begun.priors
-    if not aslant(priors) or not far_off(last.found, priors):
+    if not aslant(priors) or not far_off(last.found, priors, AWAY):
         return last
-    aside = last.begun.aside | untold(priors)
-    other = survey.tried(last.begun, in_space=True, aside=aside, name="as reported ")
+    begin = survey.beginnings(last)
+    aside = last.begun.aside | (untold(priors) - begin.centres.keys())
+    other = survey.tried(last.begun, in_space=begin, aside=aside, name="as reported ")
     before = without_photos(last.found, dict.fromkeys(aside, "hung on the others"))
     if nearer(other.found, before, priors) and agrees(other.found, before):
         return other

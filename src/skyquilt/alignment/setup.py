@@ -185,7 +185,7 @@ def set_up(
     a = np.array([start.placed[m][0] for m in members.tolist()])
     t = np.array([start.placed[m][1] for m in members.tolist()])
     yaw = -np.degrees(np.angle(a))
-    if repair and not start.in_space:
+    if repair:
         priors = steered(photos, priors, start, dict(zip(members.tolist(), yaw, strict=True)))
     lies = np.array([_yaw_lie(priors[m], y) for m, y in zip(members.tolist(), yaw, strict=True)])
     turned = np.zeros(len(photos), bool)
@@ -204,7 +204,6 @@ def set_up(
         ]
     )
     if start.in_space:
-        start_C = np.array([priors[m].map_C for m in members])
         start_R = R0.copy()
     K0, sigma_K, free = intrinsic_priors([photos[m] for m in first], distortion)
     base = Problem(
