@@ -29,6 +29,8 @@ MOST_OBLIQUE = 0.4
 """With a larger share of oblique photos than this the survey itself is oblique, and they are not
 told apart.
 """
+FAR_OFF, TURNED_DEG = 8.0, 10.0
+"""A photo so many deviations from its position, and turned so far from its angles, is elsewhere."""
 LEAST_FALL = np.cos(np.radians(60.0))
 """Flatter views count as if they fell as steeply as this: what they show best lies nearer than the
 place in their middle.
@@ -94,12 +96,14 @@ def found_oblique(
     alignment: Alignment, weak: Mapping[int, str], priors: Sequence[Prior]
 ) -> frozenset[int]:
     """Photos without reported tilt that the adjustment turned far from the vertical, and those that
-    it could not hold; none if most are. `weak`: those that are not determined.
+    it could not hold; besides, those that it turned and moved far from what they report. None if
+    most are. `weak`: those that are not determined.
     """
     linked = [*alignment.held, *alignment.rejected]
     found = {i for i in alignment.held if tilt_deg(alignment.poses[i].cam_R_map) > OBLIQUE_DEG}
     found |= alignment.rejected.keys() | weak.keys()
     guessed = {i for i in found if priors[i].sigma_tilt_deg > STATED_DEG}
+    guessed |= {i for i in alignment.held if _contradicts(alignment.poses[i], priors[i])}
     return frozenset(guessed if len(guessed) <= MOST_OBLIQUE * len(linked) else ())
 
 
@@ -147,6 +151,21 @@ def without_photos(alignment: Alignment, gone: Mapping[int, str]) -> Alignment:
         accuracy=told,
         rejected={**alignment.rejected, **gone},
     )
+
+
+def _contradicts(pose: Pose, prior: Prior) -> bool:
+    """Whether a photo looks and lies far from where it reports: begun as a vertical one, it may
+    have fallen into another minimum than that of the photos around.
+    """
+    if (
+        not prior.sigma_tilt_deg <= STATED_DEG
+        or not np.isfinite([*prior.map_C, prior.yaw_deg]).all()
+    ):
+        return False
+    told = cam_R_map_from_angles(prior.yaw_deg, prior.pitch_deg, prior.roll_deg)
+    away = np.linalg.norm((pose.map_C - prior.map_C) / prior.sigma_C)
+    turned = np.degrees(np.arccos(np.clip(pose.cam_R_map[2] @ told[2], -1, 1)))
+    return bool(away > FAR_OFF and turned > TURNED_DEG)
 
 
 def _points_of(

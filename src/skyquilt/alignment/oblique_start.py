@@ -41,7 +41,7 @@ NEIGHBOURS = 3
 NEARER = 0.95
 """Photos come nearer to their positions where their distance falls by this factor."""
 LOST = 0.8
-"""An adjustment that holds less than this share of another's photos lost them."""
+"""An adjustment that holds less than this share of another's photos or observations lost them."""
 FEWEST_CROWDED = 4
 """Photos with positions that are needed to judge whether these crowd in one place: ..."""
 CROWDED = 5.0
@@ -192,12 +192,13 @@ def off_positions(found: Alignment, priors: Sequence[Prior]) -> float:
 
 
 def nearer(other: Alignment, found: Alignment, priors: Sequence[Prior]) -> bool:
-    """Whether another adjustment's photos lie clearly nearer to their positions, and no fewer of
-    them are held; or whether it holds far more.
+    """Whether another adjustment's photos lie clearly nearer to their positions, or about as near
+    with far more observations, and no fewer of them are held; or whether it holds far more.
     """
     more, less = len(other.held), len(found.held)
-    close = off_positions(other, priors) < NEARER * off_positions(found, priors)
-    return (close and more >= less) or LOST * more > less
+    off, before = off_positions(other, priors), off_positions(found, priors)
+    fuller = LOST * len(other.ties.photo) > len(found.ties.photo) and LOST * off < before
+    return ((off < NEARER * before or fuller) and more >= less) or LOST * more > less
 
 
 def reported_start(
