@@ -16,7 +16,13 @@ from skyquilt.alignment.aligners import (
 from skyquilt.alignment.determined import deviation_px, weak_photos
 from skyquilt.alignment.dominant_plane import dominant_normal, levelled
 from skyquilt.alignment.inputs import AlignmentInputs
-from skyquilt.alignment.oblique import looked_at, reported_oblique, resected, tilt_deg
+from skyquilt.alignment.oblique import (
+    found_oblique,
+    looked_at,
+    reported_oblique,
+    resected,
+    tilt_deg,
+)
 from skyquilt.geometry.camera import project, rays
 from skyquilt.geometry.frames import cam_R_map_from_angles, rotation_from_vector
 from skyquilt.matching.candidates import Nearest
@@ -180,6 +186,22 @@ def test_reported_tilts():
     assert tilt_deg(cam_R_map_from_angles(80, 30, 40)) == pytest.approx(
         np.degrees(np.arccos(np.cos(np.radians(30)) * np.cos(np.radians(40))))
     )
+
+
+def test_a_photo_that_fell_elsewhere_is_hung_on_the_others_again():
+    done = block(LAWN, hills(3000))
+    priors = [prior(p.map_C, yaw=0.0) for p in LAWN]
+    assert found_oblique(done, {}, priors) == frozenset()
+    far = done.poses | {3: pose(-16, 41, z=77, pitch=20)}
+    assert found_oblique(replace(done, poses=far), {}, priors) == {3}
+    near = done.poses | {3: pose(20, -30, pitch=20)}  # where it reports: its angles may be false
+    assert found_oblique(replace(done, poses=near), {}, priors) == frozenset()
+    level = done.poses | {3: pose(-16, 41, z=77)}  # its position may be false
+    assert found_oblique(replace(done, poses=level), {}, priors) == frozenset()
+    untold = [replace(p, sigma_tilt_deg=6.0) for p in priors]
+    assert found_oblique(replace(done, poses=far), {}, untold) == frozenset()
+    most = {i: pose(-16, 41, z=77, pitch=20) for i in range(9)}
+    assert found_oblique(replace(done, poses=done.poses | most), {}, priors) == frozenset()
 
 
 def test_the_dominant_plane_levels_the_map_whatever_stands_on_it():

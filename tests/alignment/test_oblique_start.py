@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from skyquilt.alignment import oblique_start
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.oblique_guess import LOWERED, guessed_priors, lowered
 from skyquilt.alignment.oblique_start import (
     aslant,
+    nearer,
     reported_start,
     slanting,
     tilt_warnings,
@@ -159,6 +161,73 @@ def test_photos_without_angles_among_those_that_look_aslant_hang_on_them(pitch):
     assert len(found.held) == len(flown.photos)
     away = [np.linalg.norm(found.poses[i].map_C - t.map_C) for i, t in enumerate(flown.truth)]
     assert max(away) < 3.5
+
+
+def swaying(seed, off=0.0, without=()):
+    """Twelve photos of a drone without a gimbal, near to one another for their height, whose
+    compass is off; some report no position.
+    """
+    pitch = np.random.default_rng(seed).normal(0, 11, 12)
+    ways = [(x, line) for line in range(3) for x in ((0, 12, 24, 36), (36, 24, 12, 0))[line % 2]]
+    places = [
+        (x, 18 * line, 90.0, 90 + 180 * (line % 2), p)
+        for (x, line), p in zip(ways, pitch, strict=True)
+    ]
+    flown = Slanting(places, seed=seed, alike_deg=180)
+    flown.priors = [
+        replace(p, yaw_deg=p.yaw_deg + off, map_C=np.full(3, np.nan) if i in without else p.map_C)
+        for i, p in enumerate(flown.priors)
+    ]
+    return flown
+
+
+@pytest.mark.parametrize("off", [12.0, 60.0])
+@pytest.mark.parametrize("seed", [2, pytest.param(4, marks=pytest.mark.slow), 5])
+def test_a_compass_does_not_turn_photos_that_sway(seed, off):
+    """Their tilts point elsewhere by as much as the compass is off, which held the map by it: it
+    was turned by 2 to 15 degrees.
+    """
+    flown = swaying(seed, off)
+    away, turned = flown.errors(flown.aligned())
+    assert len(away) == 12
+    assert np.median(turned) < 1.7 and np.median(away) < 1.0
+
+
+@pytest.mark.parametrize("seed", [5, pytest.param(2, marks=pytest.mark.slow)])
+def test_photos_that_sway_and_have_no_position_begin_beside_their_neighbours(seed, monkeypatch):
+    begun = []
+    kept = oblique_start.beginnings
+
+    def noted(*given):
+        begun.append(kept(*given))
+        return begun[-1]
+
+    monkeypatch.setattr("skyquilt.alignment.bundle.beginnings", noted)
+    monkeypatch.setattr("skyquilt.alignment.repairs.AWAY", 0.0)
+    flown = swaying(seed, 60.0, without=(2, 7))
+    away, turned = flown.errors(flown.aligned())
+    assert len(away) == 12 and np.median(away) < 1.5
+    assert begun[0].centres.keys() == {2, 7}
+    for i, centre in begun[0].centres.items():
+        assert np.linalg.norm(centre - flown.truth[i].map_C) < 12
+    true = np.array([180 * (i // 4 % 2) + 90.0 for i in begun[0].yaw_deg])
+    apart = (np.array([*begun[0].yaw_deg.values()]) - true + 180) % 360 - 180
+    assert len(apart) == 10 and np.abs(apart).max() < 15  # 60 before
+
+
+def test_an_adjustment_with_far_more_observations_is_the_better_one():
+    flown = Slanting(orbit(12, 50))
+    found = flown.aligned()
+    ties = found.ties
+    some = np.arange(len(ties.point)) % 3 > 0
+    less = replace(
+        found,
+        ties=replace(
+            ties, **{n: getattr(ties, n)[some] for n in ("point", "photo", "px", "residual_px")}
+        ),
+    )
+    assert nearer(found, less, flown.priors)
+    assert not nearer(less, found, flown.priors) and not nearer(found, found, flown.priors)
 
 
 def test_photos_that_do_not_tell_their_pose_hang_on_the_others():

@@ -33,7 +33,7 @@ ENLARGED_AGAIN = 3
 """Photos that are enlarged by other factors are divided so often at most: what fits none of the
 cameras bends the heights by which the next are told.
 """
-AWAY = 1.0
+AWAY = 0.85
 """Photos that tell their poses, and lie further from their positions than this times their
 deviations in space (median; two thirds are usual), may have been begun wrongly.
 """
@@ -137,11 +137,12 @@ def repaired(first: Tried, survey: Survey) -> Tried:
 
 def _as_reported(last: Tried, survey: Survey) -> Tried:
     """Photos that look somewhat aslant begin as they report: links of these, taken for similarities
-    of the ground's plane, may put them where positions look like gross errors. Photos that do not
-    report their angles are hung on the others.
+    of the ground's plane, may put them where positions look like gross errors, or contradict one
+    another. Photos that do not report their angles are hung on the others.
     """
     priors = last.begun.priors
-    if not aslant(priors) or not far_off(last.found, priors, AWAY):
+    doubtful = len(last.found.blocks) > 1 or far_off(last.found, priors, AWAY)
+    if not (doubtful and aslant(priors)):
         return last
     begin = survey.beginnings(last)
     aside = last.begun.aside | (untold(priors) - begin.centres.keys())
