@@ -41,12 +41,17 @@ def rig(seed: int, width: int, height: int, focal: float, number: int = 2) -> li
     return found
 
 
-def seen(picture: np.ndarray, taken: Camera, band: BandCamera) -> np.ndarray:
-    """What a camera of the rig sees of a picture that another camera took."""
+def seen(
+    picture: np.ndarray, taken: Camera, band: BandCamera, moved: tuple[float, float] = (0.0, 0.0)
+) -> np.ndarray:
+    """What a camera of the rig sees of a picture that another camera took, of a plane; `moved`: how
+    far it is beside that camera, over the depth of the plane.
+    """
     R, lens = rotation_from_vector(band.turn), band.camera
     across, down = (np.arange(0, n + NODE, NODE, dtype=float) for n in (lens.width, lens.height))
     x, y = np.meshgrid(across, down)
-    px = project(taken, rays(lens, np.c_[x.ravel(), y.ravel()]) @ R).astype(np.float32)
+    ray = rays(lens, np.c_[x.ravel(), y.ravel()]) @ R
+    px = project(taken, ray / ray[:, 2:] + [*moved, 0.0]).astype(np.float32)
     at = np.meshgrid(*(np.arange(n, dtype=np.float32) / NODE for n in (lens.width, lens.height)))
     u, v = (
         cv2.remap(np.ascontiguousarray(p), *at, cv2.INTER_LINEAR)

@@ -19,9 +19,9 @@ SIZE = (480, 360)
 FOCAL = 1.15 * 760.0 * 480 / 900
 
 
-def shows(picture, band, *, negative=False):
+def shows(picture, band, *, negative=False, moved=(0.0, 0.0)):
     """A photo of a picture that a wider camera took."""
-    grey = seen(picture, WIDE, band)
+    grey = seen(picture, WIDE, band, moved)
     return np.clip(255 - grey if negative else grey, 0, 255).astype(np.uint8)
 
 
@@ -56,6 +56,21 @@ def test_bands_lie_on_each_other(seed):
     off = apart_px(found, a, b, adjusted)
     assert np.median(off) < 0.1 and np.percentile(off, 95) < 0.3 and off.max() < 1.0
     assert found.share > 0.9 and found.off_px < 0.25
+
+
+def test_a_camera_is_found_beside_the_other_where_the_depth_changes():
+    """9 cm are 0.7 to 5 px of ground at 60 to 8 m."""
+    a, b = rig(1, *SIZE, FOCAL)
+    beside, pairs = np.array([0.08, -0.05]), []
+    R = rotation_from_vector(a.turn)
+    for k, nearness in enumerate((1 / 8, 1 / 20, 1 / 60)):
+        picture = texture(700, 900, seed=k)
+        other = shows(picture, b, negative=True, moved=beside * nearness)
+        depth = np.full((3, 3), nearness)
+        pairs.append(Together(a=shows(picture, a), camera_a=a.camera, b=other, nearness=depth))
+    found = FindBandRig()(pairs, b.camera, 0.01)
+    assert isinstance(found, BandRig)
+    assert np.abs(R.T @ found.a_t_b - [*beside, 0.0]).max() < 0.01
 
 
 def test_other_ground_is_refused():

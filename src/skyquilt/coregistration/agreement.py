@@ -111,7 +111,7 @@ class Agree:
         """Rank, centre, shift and width of the peak of each patch, from row and column `first`."""
         reach = self.reach
         for top, left, side, score in self.scored(fields, target, both, across, reach, first):
-            x, y = _summit(score)
+            x, y = summit(score)
             yield (
                 self._rank(score),
                 left + (side - 1) / 2,
@@ -144,7 +144,7 @@ class Agree:
                 if both[part].mean() < self.filled:
                     continue
                 around = padded[top : top + side + 2 * reach, left : left + side + 2 * reach]
-                yield top, left, side, _scores(around, target[part] * both[part][..., None])
+                yield top, left, side, scores(around, target[part] * both[part][..., None])
 
     def _rank(self, score: NDArray[Any]) -> float:
         """Share of positions at least as good as the registered one, each with its
@@ -157,7 +157,7 @@ class Agree:
         return float((1 + (rivals >= own).sum()) / (1 + rivals.size))
 
 
-def _scores(around: Fields, patch: Fields) -> NDArray[np.float32]:
+def scores(around: Fields, patch: Fields) -> NDArray[np.float32]:
     """Normalised correlation of a patch (s, s, 4) at every position in its surroundings."""
     side = patch.shape[0]
     energy = cv2.boxFilter(
@@ -179,7 +179,7 @@ def _scores(around: Fields, patch: Fields) -> NDArray[np.float32]:
     )
 
 
-def _summit(score: NDArray[np.float32]) -> tuple[float, float]:
+def summit(score: NDArray[np.float32]) -> tuple[float, float]:
     """Column and row of the maximum, with subpixel interpolation by a parabola along each axis."""
     row, column = divmod(int(score.argmax()), score.shape[1])
     return (

@@ -68,12 +68,7 @@ def aligned_band(band: PlacedBand, placed: Alignment) -> Alignment:
     of_photo = [i for i in band.of_photo if i in placed.poses]
     if not band.rigs:
         return replace(placed, poses={i: placed.poses[i] for i in of_photo})
-    poses = {
-        i: Pose(
-            cam_R_map=band.rigs[i].b_R_a @ placed.poses[i].cam_R_map, map_C=placed.poses[i].map_C
-        )
-        for i in of_photo
-    }
+    poses = {i: _beside(placed.poses[i], band.rigs[i]) for i in of_photo}
     # by both cameras: a lens takes up what that of the map's photo leaves out
     name = {id(rig): f"{band.files.name} {n}" for n, rig in enumerate(band.rigs.values())}
     camera_of = {i: name[id(band.rigs[i])] for i in poses}
@@ -87,6 +82,11 @@ def aligned_band(band: PlacedBand, placed: Alignment) -> Alignment:
         blocks=(tuple(poses),),
         ties=no_ties(),
     )
+
+
+def _beside(pose: Pose, rig: BandRig) -> Pose:
+    """The pose of the camera of a band when the map's photo had this one."""
+    return Pose(cam_R_map=rig.b_R_a @ pose.cam_R_map, map_C=pose.map_C + rig.a_t_b @ pose.cam_R_map)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -115,7 +115,7 @@ class BandsDrawing:
     """What the rasters depend on."""
     tags: dict[str, str]
     """Metadata of the files."""
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
 
     def blocks(self, workers: Workers) -> Steps[None]:
         """Writes the rasters.

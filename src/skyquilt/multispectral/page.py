@@ -79,11 +79,13 @@ def _figures(band: PlacedBand) -> dict[str, Any]:
         "cameras": max(len(rigs), 1),
     }
     if not rigs:
-        return {**saved, "band_R_map_photo": None, "focal_px": None, "off_px": None, "agree": None}
+        of_camera = ("band_R_map_photo", "beside_m", "focal_px", "off_px", "agree")
+        return saved | dict.fromkeys(of_camera)
     off = max(r.off_px for r in rigs)
     return {
         **saved,
         "band_R_map_photo": rigs[0].b_R_a.tolist(),
+        "beside_m": rigs[0].a_t_b.round(4).tolist(),
         "focal_px": round(rigs[0].camera.focal, 2),
         "off_px": round(off, 3) if np.isfinite(off) else None,
         "agree": round(min(r.share for r in rigs), 3),

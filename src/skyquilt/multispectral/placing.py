@@ -8,10 +8,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skyquilt.engine.clock import Steps
 from skyquilt.engine.workers import Workers
 from skyquilt.imaging.grey import shrink, to_grey8
+from skyquilt.imaging.nodes import View
+from skyquilt.imaging.views import on_ground
 from skyquilt.model.camera import Camera
 from skyquilt.model.photo import Photo, RejectedPhoto, evenly
 from skyquilt.model.registration import RefusedRegistration
@@ -37,6 +40,8 @@ LONGEST = 1600
 """Longest side in px of the pictures that are compared."""
 _FAR = 0.6
 """Share of the usual height above the ground from which a capture can tell the camera."""
+_PLACES = 65
+"""Places along a side of a photo at which the depth of the ground is looked up."""
 _FAR_PX = 1.0
 """Distance of a band from the map, in px of its own, that is told."""
 _SATURATED = 0.02
@@ -163,7 +168,7 @@ def _rig(scene: Scene, band: BandFiles, of_photo: dict[int, int]) -> BandRig | R
         )
     pairs = _far(scene, pairs)
     asked = [pairs[k] for k in evenly(len(pairs), MOST_PAIRS)]
-    seen = [t for i, j in asked if (t := _together(aligned, i, band.photos[j])) is not None]
+    seen = [t for i, j in asked if (t := _together(scene, i, band.photos[j])) is not None]
     first = band.photos[pairs[0][1]] if pairs else None
     camera = Camera.ideal(width=1, height=1, focal=1.0) if first is None else first.lens
     sigma = 0.0 if first is None else first.focal.sigma_px / first.focal.px
@@ -182,14 +187,36 @@ def _far(scene: Scene, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
     return [pair for pair, used in zip(pairs, far, strict=True) if used]
 
 
-def _together(aligned: AlignedPhotos, index: int, other: Photo) -> Together | None:
+def _together(scene: Scene, index: int, other: Photo) -> Together | None:
     """Pictures of one capture; None where the band's file cannot be read."""
+    aligned = scene.aligned
     try:
         grey = to_grey8(read_color(other))
     except Exception:  # whatever it is, it concerns this photo alone; told when it is drawn
         return None
     camera = aligned.alignment.camera(index)
-    return Together(a=aligned.grey(index, LONGEST), camera_a=camera, b=shrink(grey, LONGEST)[0])
+    return Together(
+        a=aligned.grey(index, LONGEST),
+        camera_a=camera,
+        b=shrink(grey, LONGEST)[0],
+        nearness=_nearness(scene, index),
+    )
+
+
+def _nearness(scene: Scene, index: int) -> NDArray[np.float64]:
+    """(r, c) 1 over the depth in m of the ground in a photo of the map, at places from corner to
+    corner; 0 where its rays meet none.
+    """
+    alignment, camera = scene.aligned.alignment, scene.aligned.alignment.camera(index)
+    pose = alignment.poses[index]
+    x, y = np.meshgrid(
+        np.linspace(0, camera.width - 1, _PLACES), np.linspace(0, camera.height - 1, _PLACES)
+    )
+    view = View(photo=index, camera=camera, pose=pose, footprint=np.zeros((0, 2)))
+    ground = on_ground(view, np.c_[x.ravel(), y.ravel()], scene.ground.surface)
+    depth = ((ground - pose.map_C) @ pose.cam_R_map[2]).reshape(x.shape)
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.where(depth > 0, 1 / depth, 0.0))
 
 
 def _comparable(placed: Sequence[PlacedBand]) -> tuple[list[PlacedBand], Kind, list[str]]:

@@ -1,33 +1,44 @@
-"""The cameras of a multispectral rig relative to each other: a rotation and a lens for each band.
+"""The cameras of a multispectral rig relative to each other: a rotation, a place and a lens for
+each band.
 
-All cameras of a rig are a few centimetres apart, so that, seen from a drone, the pixels of two
-photos of one trigger correspond by a rotation and by both lenses, whatever the relief of the
-ground. Both are the same in all photos of a flight. So they are found from patches of many photos,
-matched by the directions of edges, which bands have in common although plants are dark in red and
-bright in the infrared (`coregistration.orientation`). The lens of the band is fitted with the
-rotation: what the lens of the other photos leaves out, it takes up, so that all bands lie on each
-other on the map.
+All cameras of a rig are a few centimetres apart and see the same ground, so that the pixels of two
+photos of one trigger correspond by a rotation, by the place of one camera beside the other and by
+both lenses. These are the same in all photos of a flight. So they are found from patches of many
+photos, matched by the directions of edges, which bands have in common although plants are dark in
+red and bright in the infrared (`coregistration.orientation`). The lens of the band is fitted with
+the rotation: what the lens of the other photos leaves out, it takes up, so that all bands lie on
+each other on the map. The place shows in how the shift changes with the depth of the ground: on
+level ground it does not, and there the rotation takes up all of it.
 """
 
+import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cache
+from math import ceil
 from typing import Any, ClassVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 from scipy.optimize import least_squares
 
-from skyquilt.coregistration.agreement import Agree
+from skyquilt.coregistration.agreement import scores, summit
 from skyquilt.coregistration.orientation import Orientation, orientation
 from skyquilt.geometry.camera import project, rays
 from skyquilt.geometry.frames import rotation_from_vector
 from skyquilt.model.camera import Camera
+from skyquilt.model.photo import evenly
 from skyquilt.model.registration import RefusedRegistration
 
 Array = NDArray[np.float64]
 _NODE = 16
 """Pixels of a reduced photo between the nodes at which a photo is projected into the other."""
+_ACROSS = 10
+"""Patches along the side of a square of a photo's area."""
+_FILLED = 0.6
+"""Least share of a patch that both photos must cover."""
 _FREE = ("focal", "cx", "cy", "k1", "aspect", "k2", "k3", "p1", "p2")
 _OF_ROUND = (0, 4, 6, len(_FREE))
 """How many of these are fitted in each round: what bends the rim most comes last, when the rim is
@@ -45,6 +56,10 @@ class Together:
     """Its calibration, of its full size."""
     b: NDArray[np.uint8]
     """(h, w) the photo of the band, grey, reduced or not."""
+    nearness: Array = field(default_factory=lambda: np.zeros((2, 2)))
+    """(r, c) 1 over the depth in m of the ground along the axis of the map's camera, at places
+    evenly distributed from corner to corner of its photo; 0 for ground that is infinitely far.
+    """
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -53,6 +68,8 @@ class BandRig:
 
     b_R_a: Array
     """(3, 3) takes camera coordinates of the map's photos to those of the band."""
+    a_t_b: Array
+    """(3,) where the band's camera is, m along the axes of that of the map's photos."""
     camera: Camera
     """The calibration of the band's camera."""
     pairs: int
@@ -75,22 +92,67 @@ class _Matched:
     """(n, 2) px of the map's photos at full size."""
     px_b: Array
     """(n, 2) px of the band at full size."""
+    nearness: Array
+    """(n,) 1 over their depth in m."""
     pair: NDArray[np.intp]
     """(n,) pair that each was matched in."""
     camera_a: Camera
     """Calibration of the map's photos."""
 
+    def only(self, kept: NDArray[np.bool_]) -> "_Matched":
+        """These (n,) of them."""
+        parts = {n: getattr(self, n)[kept] for n in ("px_a", "px_b", "nearness", "pair")}
+        return replace(self, **parts)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Beside:
+    """A camera beside that of the map's photos."""
+
+    turn: Array
+    """(3,) rotation vector from the camera of the map's photos to it."""
+    place: Array
+    """(2,) where it is, m along the columns and the rows of the map's photos."""
+    camera: Camera
+    """Its lens."""
+
+    @property
+    def R(self) -> Array:
+        """(3, 3) from the camera of the map's photos to it."""
+        return rotation_from_vector(self.turn)
+
+    def sees(self, ray_a: Array, nearness: Array) -> Array:
+        """Its pixels (n, 2) of what lies on rays (n, 3) of the map's camera, at 1 over a depth."""
+        return np.asarray(project(self.camera, (ray_a - self._moved(nearness)) @ self.R.T))
+
+    def _moved(self, nearness: Array) -> Array:
+        """(n, 3) by how much the rays to a place differ."""
+        return np.outer(nearness, [*self.place, 0.0])
+
+    def in_photo(self, px: Array, small: Camera, pair: Together) -> tuple[Array, Array]:
+        """Where the map's photo shows pixels (n, 2) of this camera, whose lens is `small` on a
+        reduced photo, and 1 over their depth (n,). NaN where it does not.
+        """
+        ray = rays(small, px) @ self.R
+        ray = ray / ray[:, 2:]
+        near = _at(pair, project(pair.camera_a, ray))
+        return np.asarray(project(pair.camera_a, ray + self._moved(near))), near
+
 
 @dataclass(frozen=True, kw_only=True)
 class FindBandRig:
-    """Matches patches of pairs of photos at rising resolution, and fits a rotation and a lens to
-    all of them.
+    """Matches patches of pairs of photos at rising resolution, and fits a rotation, a place and a
+    lens to all of them.
     """
 
     sides: tuple[int, ...] = (256, 400, 640, 640)
     """Sides of the squares to whose areas photos are reduced, one round each."""
     reach: tuple[int, ...] = (12, 6, 5, 3)
     """Largest shift in px at that resolution that is looked for."""
+    apart: tuple[float, ...] = (1.0, 1.0, 1.0, 0.7)
+    """Sides of a patch between neighbours, at most."""
+    share: tuple[float, ...] = (0.5, 0.5, 1.0, 1.0)
+    """Share of the pairs that are matched: the first rounds find little but the rotation."""
     scatter_px: float = 0.3
     """Scatter of a match in px of a reduced photo, beyond which its weight falls."""
     agree_px: float = 1.0
@@ -101,7 +163,9 @@ class FindBandRig:
     """
     minimum: int = 3
     """Fewest pairs of photos."""
-    version: ClassVar[int] = 2
+    sigma_m: float = 0.1
+    """Standard deviation of the distance in m between two cameras along either axis."""
+    version: ClassVar[int] = 3
 
     def __call__(
         self, pairs: Sequence[Together], camera_b: Camera, sigma_focal: float
@@ -116,112 +180,104 @@ class FindBandRig:
                 reason=f"{len(pairs)} of its photos were taken together with one of the map's, and"
                 f" {self.minimum} are needed"
             )
-        turn, camera = np.zeros(3), camera_b
-        known: dict[tuple[int, int], Orientation] = {}
-        for step, (side, reach) in enumerate(zip(self.sides, self.reach, strict=True)):
-            found = self._matched(pairs, turn, camera, side, reach, known)
+        there = _Beside(turn=np.zeros(3), place=np.zeros(2), camera=camera_b)
+
+        @cache
+        def oriented(k: int, side: int) -> Orientation:
+            return _oriented(pairs[k].b, side)
+
+        rounds = zip(self.sides, self.reach, self.apart, strict=True)
+        for step, (side, reach, apart) in enumerate(rounds):
+            few = evenly(len(pairs), max(self.minimum, ceil(self.share[step] * len(pairs))))
+            seen = [(k, pairs[k], oriented(k, side)) for k in few]
+            found = self._matched(seen, there, reach, apart)
             scale = _scale(camera_b, side)
             if not len(found.px_a):
                 return RefusedRegistration(reason="its photos and the map's have nothing in common")
-            turn, camera = self._fitted(found, turn, camera, camera_b, step, scale, sigma_focal)
-        off = _off(found, turn, camera) / scale
-        agree = off < self.agree_px
+            there = self._fitted(found, there, camera_b, step, scale, sigma_focal)
+        agree = _off(found, there) / scale < self.agree_px
         if agree.mean() < self.least_share:
             return RefusedRegistration(
                 reason=f"{agree.mean():.0%} of the patches of its photos agree on one camera beside"
                 " that of the map's photos"
             )
         return BandRig(
-            b_R_a=rotation_from_vector(turn),
-            camera=camera,
+            b_R_a=there.R,
+            a_t_b=np.array([*there.place, 0.0]),
+            camera=there.camera,
             pairs=len(pairs),
             patches=int(agree.sum()),
             share=float(agree.mean()),
-            off_px=self._kept_out(found, turn, camera, camera_b, scale, sigma_focal),
+            off_px=self._kept_out(found, there, camera_b, scale, sigma_focal),
         )
 
     def _matched(
         self,
-        pairs: Sequence[Together],
-        turn: Array,
-        camera: Camera,
-        side: int,
+        pairs: Sequence[tuple[int, Together, Orientation]],
+        there: _Beside,
         reach: int,
-        known: dict[tuple[int, int], Orientation],
+        apart: float,
     ) -> _Matched:
-        """Patches of all pairs, matched around where the rig so far has them."""
-        agree = Agree(across=(10,), reach=reach, near=1)
-        R, rows = rotation_from_vector(turn), []
-        for k, pair in enumerate(pairs):
-            b = known.setdefault((k, side), _oriented(pair.b, side))
-            small = _small(camera, b)
-            seen, valid = _seen(pair, R, small, b.shape)
+        """Patches of pairs (with their index, and the fields of the band's photo), matched around
+        where the camera so far has them.
+        """
+        rows = []
+        for k, pair, b in pairs:
+            small = _small(there.camera, b)
+            seen, valid = _seen(pair, there, small, b.shape)
             a = orientation(seen, valid, float(np.sqrt(seen.size)), quick=True)
-            shifts = agree.shifts(a, b, np.eye(3))
-            within = np.abs(shifts.shift).max(1, initial=0) < reach - 0.5
-            px_b = _full(shifts.px + shifts.shift, small, camera)[within]
-            px_a = _there(shifts.px[within], R, small, pair.camera_a)
-            rows.append((px_a, px_b, np.full(len(px_a), k, np.intp)))
-        px_a, px_b, pair_ = (np.concatenate([row[n] for row in rows]) for n in range(3))
-        return _Matched(px_a=px_a, px_b=px_b, pair=pair_, camera_a=pairs[0].camera_a)
+            px, shift = _shifts(a, b, reach, apart)
+            px_b = _full(px + shift, small, there.camera)
+            px_a, near = there.in_photo(px, small, pair)
+            rows.append((px_a, px_b, near, np.full(len(px_a), k, np.intp)))
+        px_a, px_b, near, pair_ = (np.concatenate([row[n] for row in rows]) for n in range(4))
+        return _Matched(
+            px_a=px_a, px_b=px_b, nearness=near, pair=pair_, camera_a=pairs[0][1].camera_a
+        )
 
     def _fitted(
         self,
         found: _Matched,
-        turn: Array,
-        camera: Camera,
+        start: _Beside,
         told: Camera,
         step: int,
         scale: float,
         sigma_focal: float,
-    ) -> tuple[Array, Camera]:
-        """Rotation vector and lens that fit best; `scale`: px of the band for one of the reduced
-        photos.
-        """
+    ) -> _Beside:
+        """The camera that fits best; `scale`: px of the band for one of the reduced photos."""
         free = _FREE[: _OF_ROUND[step]]
         sigma = self.scatter_px * scale
         spread = _deviations(told, sigma_focal)
         ray_a = rays(found.camera_a, found.px_a)
 
-        def lens(x: Array) -> Camera:
-            changed: dict[str, Any] = dict(zip(free, map(float, x[3:]), strict=True))
-            return replace(camera, **changed)
+        def camera(x: Array) -> _Beside:
+            changed: dict[str, Any] = dict(zip(free, map(float, x[5:]), strict=True))
+            lens = replace(start.camera, **changed)
+            return _Beside(turn=x[:3], place=x[3:5], camera=lens)
 
         def misfit(x: Array) -> Array:
-            there = project(lens(x), ray_a @ rotation_from_vector(x[:3]).T)
             # what is far off counts like what is three deviations off
-            off = np.nan_to_num(there - found.px_b, nan=1e3) / sigma
+            off = np.nan_to_num(camera(x).sees(ray_a, found.nearness) - found.px_b, nan=1e3) / sigma
             length = np.linalg.norm(off, axis=1, keepdims=True)
             weight = np.sqrt(np.log1p((length / 2) ** 2) / np.maximum((length / 2) ** 2, 1e-12))
-            prior = [(x[3 + k] - getattr(told, n)) / spread[n] for k, n in enumerate(free)]
-            return np.concatenate([(off * weight).ravel(), prior])
+            prior = [(x[5 + k] - getattr(told, n)) / spread[n] for k, n in enumerate(free)]
+            return np.concatenate([(off * weight).ravel(), x[3:5] / self.sigma_m, prior])
 
-        start = np.concatenate([turn, [getattr(camera, n) for n in free]])
-        unit = np.array([1e-3, 1e-3, 1e-3, *(spread[n] for n in free)])
-        best = least_squares(misfit, start, x_scale=unit, method="trf", max_nfev=60).x
-        return np.asarray(best[:3]), lens(best)
+        first = [*start.turn, *start.place, *(getattr(start.camera, n) for n in free)]
+        unit = [1e-3] * 3 + [self.sigma_m] * 2 + [spread[n] for n in free]
+        best = least_squares(misfit, np.array(first), x_scale=unit, method="trf", max_nfev=60).x
+        return camera(np.asarray(best))
 
     def _kept_out(
-        self,
-        found: _Matched,
-        turn: Array,
-        camera: Camera,
-        told: Camera,
-        scale: float,
-        sigma_focal: float,
+        self, found: _Matched, there: _Beside, told: Camera, scale: float, sigma_focal: float
     ) -> float:
         """Median distance of the patches of each half of the pairs from the rig of the other."""
         off = []
         for half in (0, 1):
-            here = found.pair % 2 == half
-            part, rest = (
-                replace(found, px_a=found.px_a[k], px_b=found.px_b[k], pair=found.pair[k])
-                for k in (here, ~here)
-            )
-            if not len(part.px_a) or not len(rest.px_a):
-                continue
-            of_rest = self._fitted(rest, turn, camera, told, len(_OF_ROUND) - 1, scale, sigma_focal)
-            off.append(_off(part, *of_rest))
+            part, rest = (found.only(k) for k in (found.pair % 2 == half, found.pair % 2 != half))
+            if len(part.px_a) and len(rest.px_a):
+                step = len(_OF_ROUND) - 1
+                off.append(_off(part, self._fitted(rest, there, told, step, scale, sigma_focal)))
         return float(np.median(np.concatenate(off))) if off else float("nan")
 
 
@@ -263,21 +319,26 @@ def _full(px: Array, small: Camera, full: Camera) -> Array:
     return np.asarray((px + 0.5) * scale - 0.5)
 
 
-def _there(px: Array, R: Array, small: Camera, camera_a: Camera) -> Array:
-    """Places (n, 2) of a reduced band in px of the full photo of the map; NaN where it does not see
-    them.
+def _at(pair: Together, px_a: Array) -> Array:
+    """(n,) 1 over the depth at places (n, 2) of a map's photo, between nodes; that of the rim
+    beyond it.
     """
-    return np.asarray(project(camera_a, rays(small, px) @ R))
+    rows, columns = pair.nearness.shape
+    last = np.array([columns - 1, rows - 1])
+    size = np.array([pair.camera_a.width - 1, pair.camera_a.height - 1])
+    node = np.clip(np.nan_to_num(px_a) / size * last, 0, last)
+    found = map_coordinates(pair.nearness, node[:, ::-1].T, order=1, mode="nearest")
+    return np.asarray(found, np.float64)
 
 
 def _seen(
-    pair: Together, R: Array, small: Camera, shape: tuple[int, int]
+    pair: Together, beside: _Beside, small: Camera, shape: tuple[int, int]
 ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
     """The photo of the map as the reduced band (h, w) sees it, and where it shows anything."""
     h, w = shape
     rows, columns = (np.arange(0, n + _NODE, _NODE, dtype=np.float64) for n in (h, w))
     x, y = np.meshgrid(columns, rows)
-    there = _there(np.c_[x.ravel(), y.ravel()], R, small, pair.camera_a).reshape(*x.shape, 2)
+    there = beside.in_photo(np.c_[x.ravel(), y.ravel()], small, pair)[0].reshape(*x.shape, 2)
     scale = max(pair.a.shape) / max(pair.camera_a.width, pair.camera_a.height)
     there = ((there + 0.5) * scale - 0.5).astype(np.float32)
     # nodes of an enlarged image, whose corners lie at the first and the last node
@@ -298,8 +359,33 @@ def _seen(
     return seen.astype(np.float32), valid
 
 
-def _off(found: _Matched, turn: Array, camera: Camera) -> Array:
-    """(n,) distance in px of the band between places and where a rig has them."""
-    R = rotation_from_vector(turn)
-    there = project(camera, rays(found.camera_a, found.px_a) @ R.T)
-    return np.asarray(np.linalg.norm(there - found.px_b, axis=1))
+def _shifts(a: Orientation, b: Orientation, reach: int, apart: float) -> tuple[Array, Array]:
+    """Centres (n, 2) in px of patches that a and b (h, w) cover, from edge to edge, and the shift
+    (n, 2) at which b's content lies where a has it; without those shifted by `reach`.
+    """
+    height, width = b.shape
+    side = int(np.sqrt(height * width) / _ACROSS)
+    tops, lefts = (
+        np.linspace(0, n - side, 1 + ceil((n - side) / (apart * side))).astype(int)
+        for n in (height, width)
+    )
+    fields = cv2.copyMakeBorder(
+        a.fields, reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=(0,) * 4
+    )
+    both, found = a.valid * b.valid, []
+    for top, left in itertools.product(tops, lefts):
+        part = (slice(top, top + side), slice(left, left + side))
+        if both[part].mean() < _FILLED:
+            continue
+        around = fields[top : top + side + 2 * reach, left : left + side + 2 * reach]
+        x, y = summit(scores(around, b.fields[part] * both[part][..., None]))
+        if max(abs(reach - x), abs(reach - y)) < reach - 0.5:
+            found.append((left + (side - 1) / 2, top + (side - 1) / 2, reach - x, reach - y))
+    table = np.array(found, np.float64).reshape(-1, 4)
+    return table[:, :2], table[:, 2:]
+
+
+def _off(found: _Matched, there: _Beside) -> Array:
+    """(n,) distance in px of the band between places and where a camera has them."""
+    px = there.sees(rays(found.camera_a, found.px_a), found.nearness)
+    return np.asarray(np.linalg.norm(px - found.px_b, axis=1))
