@@ -56,6 +56,8 @@ class PlacedBand:
     are of several cameras; empty where the map's photos are its files."""
     saturated: float = 0.0
     """Share of saturated pixels in its files."""
+    detail: float | None = None
+    """Fine detail of its files over that of the middle one of all bands; None: not known."""
 
     def without(self, name: str) -> "PlacedBand":
         """The band without a file that cannot be read."""

@@ -76,6 +76,7 @@ def _figures(band: PlacedBand) -> dict[str, Any]:
         "photos": len(band.of_photo),
         "photos_total": len(files.photos),
         "saturated": round(band.saturated, 4),
+        "detail": None if band.detail is None else round(band.detail, 3),
         "cameras": max(len(rigs), 1),
     }
     if not rigs:
@@ -160,15 +161,16 @@ def _table(shown: Sequence[Mapping[str, Any]]) -> Table:
             f"{b['photos']} of {b['photos_total']}",
             cell(b["off_px"], 2),
             cell(None if b["agree"] is None else 100 * b["agree"], 0),
+            cell(None if b["detail"] is None else 100 * b["detail"], 0),
         )
         for b in shown
     )
     return Table(
         title="Bands of bands.tif",
-        head=("band", "wavelength, nm", "photos", "off, px", "patches that agree, %"),
+        head=("band", "wavelength, nm", "photos", "off, px", "patches that agree, %", "detail, %"),
         rows=rows,
-        numeric="tntnn",
+        numeric="tntnnn",
         note="Off: median distance of patches of half of the captures from where the camera found"
         " from the other half has them, scatter of the matches included. A dash: the map's own"
-        " band.",
+        " band. Detail: fine detail of its files over that of the middle one of all bands.",
     )

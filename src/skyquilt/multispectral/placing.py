@@ -26,6 +26,7 @@ from skyquilt.multispectral.captures import (
     tags_of,
 )
 from skyquilt.multispectral.draw import PlacedBand
+from skyquilt.multispectral.focus import relative_detail, typical, unsharp_notes
 from skyquilt.multispectral.recorded import Recorded, look_at
 from skyquilt.multispectral.reflectance import KINDS, Kind, common_kind
 from skyquilt.multispectral.rig import BandRig, FindBandRig, Together
@@ -100,11 +101,16 @@ def place_bands(scene: Scene, others: Sequence[Photo], workers: Workers) -> Step
             why = f"none of its files can be used: {next(iter(useless.values()), '')}"
             refused[band.name] = next(iter(reasons.values()), why)
     yield len(found), len(found), ""
-    placed = [replace(b, saturated=_saturated(b, recorded)) for b in placed]
+    detail = relative_detail(placed, recorded)
+    placed = [
+        replace(b, saturated=_saturated(b, recorded), detail=typical(detail.get(b.files.name, {})))
+        for b in placed
+    ]
     placed.sort(key=lambda b: b.files.order)
     bands, kind, weaker = _comparable(placed)
     notes = [f"The band {name} is left out: {reason}." for name, reason in refused.items()]
-    notes += [note for b in placed for note in _notes(b)] + weaker
+    notes += [note for b in placed for note in _notes(b)]
+    notes += unsharp_notes(placed, detail) + weaker
     return Placing(
         bands=bands,
         kind=kind,

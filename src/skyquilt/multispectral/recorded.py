@@ -4,10 +4,13 @@ Such a file is placed beside the map's photo of its capture, whatever it shows, 
 would tell: a black file of the near infrared would make an NDVI of -1.
 """
 
+import math
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
 
+from skyquilt.imaging.grey import detail, to_grey8
 from skyquilt.model.photo import Photo
 from skyquilt.multispectral.reflectance import Reflectance
 from skyquilt.photos.pixels import lost, read_color
@@ -32,6 +35,9 @@ class Recorded:
     """Why it is not drawn; empty where it is."""
     saturated: float = 0.0
     """Share of its pixels that are saturated."""
+    detail: float = math.nan
+    """Logarithm of its fine over its coarse detail (`imaging.grey.detail`), along the axis on which
+    it is less; NaN where it is too small."""
     gone: bool = False
     """Whether it changed or disappeared since it was found, so that another run may see it."""
 
@@ -55,4 +61,7 @@ def look_at(item: tuple[Photo, Reflectance]) -> Recorded:
         median, bright = np.percentile(known, (50, 99)) - convert.black_level
         if median < _DARK * convert.full and bright < _BRIGHT * convert.full:
             return Recorded(reason="it is black: nothing in it is brighter than its black level")
-    return Recorded(saturated=saturated)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # all cells of a small file are NaN
+        fine = np.nanmedian(detail(to_grey8(pixels))[..., :2], axis=(0, 1)).min()
+    return Recorded(saturated=saturated, detail=float(fine))

@@ -163,7 +163,7 @@ class FindBandRig:
     """
     minimum: int = 3
     """Fewest pairs of photos."""
-    sigma_m: float = 0.1
+    sigma_m: float = 0.05
     """Standard deviation of the distance in m between two cameras along either axis."""
     version: ClassVar[int] = 3
 
