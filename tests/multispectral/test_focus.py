@@ -21,7 +21,7 @@ CAPTURES = 3
 
 @pytest.fixture(scope="module")
 def told(tmp_path_factory):
-    """Makes four bands, and what is recorded in each file; `blurred`: px by band, `shaken`: file."""
+    """Makes four bands, and what each file recorded; `blurred`: px by band, `shaken`: a file."""
     folder = tmp_path_factory.mktemp("bands")
 
     def made(blurred=None, shaken=""):

@@ -10,7 +10,8 @@ from skyquilt.geometry.camera import project, rays
 from skyquilt.geometry.frames import rotation_from_vector
 from skyquilt.model.camera import Camera
 from skyquilt.model.registration import RefusedRegistration
-from skyquilt.multispectral.rig import BandRig, FindBandRig, Together
+from skyquilt.multispectral.beside import Together
+from skyquilt.multispectral.rig import BandRig, FindBandRig
 from tests.multispectral.rigs import BandCamera, rig, seen
 from tests.texture import texture
 
@@ -71,6 +72,16 @@ def test_a_camera_is_found_beside_the_other_where_the_depth_changes():
     found = FindBandRig()(pairs, b.camera, 0.01)
     assert isinstance(found, BandRig)
     assert np.abs(R.T @ found.a_t_b - [*beside, 0.0]).max() < 0.01
+
+
+@pytest.mark.slow
+def test_a_knocked_lens_is_found():
+    """It looks 4 degrees aside and is turned by 5 about its axis."""
+    a, b = rig(2, *SIZE, FOCAL)
+    b = replace(b, turn=b.turn + np.radians([3.0, -2.6, 5.0]))
+    found = FindBandRig()(captures(a, b), b.camera, 0.01)
+    assert isinstance(found, BandRig)
+    assert np.median(apart_px(found, a, b, a.camera)) < 0.1
 
 
 def test_other_ground_is_refused():

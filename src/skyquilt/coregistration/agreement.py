@@ -158,17 +158,17 @@ class Agree:
 
 
 def scores(around: Fields, patch: Fields) -> NDArray[np.float32]:
-    """Normalised correlation of a patch (s, s, 4) at every position in its surroundings."""
-    side = patch.shape[0]
+    """Normalised correlation of a patch (h, w, 4) at every position in its surroundings."""
+    high, wide = patch.shape[:2]
     energy = cv2.boxFilter(
         np.einsum("ijk,ijk->ij", around, around),
         -1,
-        (side, side),
+        (wide, high),
         anchor=(0, 0),
         normalize=False,
         borderType=cv2.BORDER_CONSTANT,
     )
-    rows, columns = (size - side + 1 for size in around.shape[:2])
+    rows, columns = around.shape[0] - high + 1, around.shape[1] - wide + 1
     product = np.zeros((rows, columns), np.float32)
     for k in range(around.shape[2]):
         one = np.ascontiguousarray(around[..., k])

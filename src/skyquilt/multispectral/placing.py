@@ -18,6 +18,7 @@ from skyquilt.imaging.views import on_ground
 from skyquilt.model.camera import Camera
 from skyquilt.model.photo import Photo, RejectedPhoto, evenly
 from skyquilt.model.registration import RefusedRegistration
+from skyquilt.multispectral.beside import Together
 from skyquilt.multispectral.captures import (
     THERMAL,
     BandFiles,
@@ -29,7 +30,7 @@ from skyquilt.multispectral.draw import PlacedBand
 from skyquilt.multispectral.focus import relative_detail, typical, unsharp_notes
 from skyquilt.multispectral.recorded import Recorded, look_at
 from skyquilt.multispectral.reflectance import KINDS, Kind, common_kind
-from skyquilt.multispectral.rig import BandRig, FindBandRig, Together
+from skyquilt.multispectral.rig import BandRig, FindBandRig
 from skyquilt.photos.pixels import read_color
 from skyquilt.workflows.flow import AlignedPhotos, Scene
 

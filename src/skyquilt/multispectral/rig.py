@@ -12,29 +12,25 @@ level ground it does not, and there the rotation takes up all of it.
 """
 
 import itertools
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from math import ceil
 from typing import Any, ClassVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 from scipy.optimize import least_squares
 
 from skyquilt.coregistration.agreement import scores, summit
-from skyquilt.coregistration.orientation import Orientation, orientation
-from skyquilt.geometry.camera import project, rays
-from skyquilt.geometry.frames import rotation_from_vector
+from skyquilt.coregistration.orientation import Orientation
+from skyquilt.geometry.camera import rays
 from skyquilt.model.camera import Camera
 from skyquilt.model.photo import evenly
 from skyquilt.model.registration import RefusedRegistration
+from skyquilt.multispectral.beside import Beside, Together, oriented, padded, seen_by, turned
 
 Array = NDArray[np.float64]
-_NODE = 16
-"""Pixels of a reduced photo between the nodes at which a photo is projected into the other."""
 _ACROSS = 10
 """Patches along the side of a square of a photo's area."""
 _FILLED = 0.6
@@ -44,22 +40,6 @@ _OF_ROUND = (0, 4, 6, len(_FREE))
 """How many of these are fitted in each round: what bends the rim most comes last, when the rim is
 matched rightly.
 """
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Together:
-    """Two photos of one trigger."""
-
-    a: NDArray[np.uint8]
-    """(H, W) the photo of the map, grey, reduced or not."""
-    camera_a: Camera
-    """Its calibration, of its full size."""
-    b: NDArray[np.uint8]
-    """(h, w) the photo of the band, grey, reduced or not."""
-    nearness: Array = field(default_factory=lambda: np.zeros((2, 2)))
-    """(r, c) 1 over the depth in m of the ground along the axis of the map's camera, at places
-    evenly distributed from corner to corner of its photo; 0 for ground that is infinitely far.
-    """
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -105,40 +85,6 @@ class _Matched:
         return replace(self, **parts)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Beside:
-    """A camera beside that of the map's photos."""
-
-    turn: Array
-    """(3,) rotation vector from the camera of the map's photos to it."""
-    place: Array
-    """(2,) where it is, m along the columns and the rows of the map's photos."""
-    camera: Camera
-    """Its lens."""
-
-    @property
-    def R(self) -> Array:
-        """(3, 3) from the camera of the map's photos to it."""
-        return rotation_from_vector(self.turn)
-
-    def sees(self, ray_a: Array, nearness: Array) -> Array:
-        """Its pixels (n, 2) of what lies on rays (n, 3) of the map's camera, at 1 over a depth."""
-        return np.asarray(project(self.camera, (ray_a - self._moved(nearness)) @ self.R.T))
-
-    def _moved(self, nearness: Array) -> Array:
-        """(n, 3) by how much the rays to a place differ."""
-        return np.outer(nearness, [*self.place, 0.0])
-
-    def in_photo(self, px: Array, small: Camera, pair: Together) -> tuple[Array, Array]:
-        """Where the map's photo shows pixels (n, 2) of this camera, whose lens is `small` on a
-        reduced photo, and 1 over their depth (n,). NaN where it does not.
-        """
-        ray = rays(small, px) @ self.R
-        ray = ray / ray[:, 2:]
-        near = _at(pair, project(pair.camera_a, ray))
-        return np.asarray(project(pair.camera_a, ray + self._moved(near))), near
-
-
 @dataclass(frozen=True, kw_only=True)
 class FindBandRig:
     """Matches patches of pairs of photos at rising resolution, and fits a rotation, a place and a
@@ -163,6 +109,8 @@ class FindBandRig:
     """
     minimum: int = 3
     """Fewest pairs of photos."""
+    sure: float = 0.9
+    """Share of the patches that agree from which nothing better is looked for."""
     sigma_m: float = 0.05
     """Standard deviation of the distance in m between two cameras along either axis."""
     version: ClassVar[int] = 3
@@ -180,22 +128,16 @@ class FindBandRig:
                 reason=f"{len(pairs)} of its photos were taken together with one of the map's, and"
                 f" {self.minimum} are needed"
             )
-        there = _Beside(turn=np.zeros(3), place=np.zeros(2), camera=camera_b)
-
-        @cache
-        def oriented(k: int, side: int) -> Orientation:
-            return _oriented(pairs[k].b, side)
-
-        rounds = zip(self.sides, self.reach, self.apart, strict=True)
-        for step, (side, reach, apart) in enumerate(rounds):
-            few = evenly(len(pairs), max(self.minimum, ceil(self.share[step] * len(pairs))))
-            seen = [(k, pairs[k], oriented(k, side)) for k in few]
-            found = self._matched(seen, there, reach, apart)
-            scale = _scale(camera_b, side)
-            if not len(found.px_a):
-                return RefusedRegistration(reason="its photos and the map's have nothing in common")
-            there = self._fitted(found, there, camera_b, step, scale, sigma_focal)
-        agree = _off(found, there) / scale < self.agree_px
+        straight = Beside(turn=np.zeros(3), place=np.zeros(2), camera=camera_b)
+        fields = cache(lambda k, side: oriented(pairs[k].b, side))
+        best = self._from(straight, pairs, fields, sigma_focal)
+        if best is None or best[2].mean() < self.sure:
+            other = self._from(turned(pairs, straight), pairs, fields, sigma_focal)
+            if other is not None and (best is None or other[2].mean() > best[2].mean()):
+                best = other
+        if best is None:
+            return RefusedRegistration(reason="its photos and the map's have nothing in common")
+        there, found, agree = best
         if agree.mean() < self.least_share:
             return RefusedRegistration(
                 reason=f"{agree.mean():.0%} of the patches of its photos agree on one camera beside"
@@ -208,13 +150,35 @@ class FindBandRig:
             pairs=len(pairs),
             patches=int(agree.sum()),
             share=float(agree.mean()),
-            off_px=self._kept_out(found, there, camera_b, scale, sigma_focal),
+            off_px=self._kept_out(found, there, camera_b, sigma_focal),
         )
+
+    def _from(
+        self,
+        there: Beside,
+        pairs: Sequence[Together],
+        fields: Callable[[int, int], Orientation],
+        sigma_focal: float,
+    ) -> tuple[Beside, _Matched, NDArray[np.bool_]] | None:
+        """The camera that is found from a first one, the patches of the last round, and which of
+        them agree; None where none were matched. `fields`: those of the band's photo of a pair,
+        reduced to a side.
+        """
+        told = there.camera
+        rounds = zip(self.sides, self.reach, self.apart, strict=True)
+        for step, (side, reach, apart) in enumerate(rounds):
+            few = evenly(len(pairs), max(self.minimum, ceil(self.share[step] * len(pairs))))
+            seen = [(k, pairs[k], fields(k, side)) for k in few]
+            found = self._matched(seen, there, reach, apart)
+            if not len(found.px_a):
+                return None
+            there = self._fitted(found, there, told, step, sigma_focal)
+        return there, found, _off(found, there) / _scale(told, self.sides[-1]) < self.agree_px
 
     def _matched(
         self,
         pairs: Sequence[tuple[int, Together, Orientation]],
-        there: _Beside,
+        there: Beside,
         reach: int,
         apart: float,
     ) -> _Matched:
@@ -223,9 +187,8 @@ class FindBandRig:
         """
         rows = []
         for k, pair, b in pairs:
-            small = _small(there.camera, b)
-            seen, valid = _seen(pair, there, small, b.shape)
-            a = orientation(seen, valid, float(np.sqrt(seen.size)), quick=True)
+            small = there.reduced(b.shape)
+            a = seen_by(pair, there, b.shape)
             px, shift = _shifts(a, b, reach, apart)
             px_b = _full(px + shift, small, there.camera)
             px_a, near = there.in_photo(px, small, pair)
@@ -236,24 +199,18 @@ class FindBandRig:
         )
 
     def _fitted(
-        self,
-        found: _Matched,
-        start: _Beside,
-        told: Camera,
-        step: int,
-        scale: float,
-        sigma_focal: float,
-    ) -> _Beside:
-        """The camera that fits best; `scale`: px of the band for one of the reduced photos."""
+        self, found: _Matched, start: Beside, told: Camera, step: int, sigma_focal: float
+    ) -> Beside:
+        """The camera that fits best in a round."""
         free = _FREE[: _OF_ROUND[step]]
-        sigma = self.scatter_px * scale
+        sigma = self.scatter_px * _scale(told, self.sides[step])
         spread = _deviations(told, sigma_focal)
         ray_a = rays(found.camera_a, found.px_a)
 
-        def camera(x: Array) -> _Beside:
+        def camera(x: Array) -> Beside:
             changed: dict[str, Any] = dict(zip(free, map(float, x[5:]), strict=True))
             lens = replace(start.camera, **changed)
-            return _Beside(turn=x[:3], place=x[3:5], camera=lens)
+            return Beside(turn=x[:3], place=x[3:5], camera=lens)
 
         def misfit(x: Array) -> Array:
             # what is far off counts like what is three deviations off
@@ -268,16 +225,14 @@ class FindBandRig:
         best = least_squares(misfit, np.array(first), x_scale=unit, method="trf", max_nfev=60).x
         return camera(np.asarray(best))
 
-    def _kept_out(
-        self, found: _Matched, there: _Beside, told: Camera, scale: float, sigma_focal: float
-    ) -> float:
+    def _kept_out(self, found: _Matched, there: Beside, told: Camera, sigma_focal: float) -> float:
         """Median distance of the patches of each half of the pairs from the rig of the other."""
         off = []
         for half in (0, 1):
             part, rest = (found.only(k) for k in (found.pair % 2 == half, found.pair % 2 != half))
             if len(part.px_a) and len(rest.px_a):
                 step = len(_OF_ROUND) - 1
-                off.append(_off(part, self._fitted(rest, there, told, step, scale, sigma_focal)))
+                off.append(_off(part, self._fitted(rest, there, told, step, sigma_focal)))
         return float(np.median(np.concatenate(off))) if off else float("nan")
 
 
@@ -303,60 +258,10 @@ def _scale(camera: Camera, side: int) -> float:
     return max(1.0, float(np.sqrt(camera.width * camera.height)) / side)
 
 
-def _oriented(grey: NDArray[np.uint8], side: int) -> Orientation:
-    return orientation(grey.astype(np.float32), np.ones(grey.shape, np.bool_), side, quick=True)
-
-
-def _small(camera: Camera, reduced: Orientation) -> Camera:
-    """The lens on a reduced photo."""
-    height, width = reduced.shape
-    return camera.rescaled(width, height)
-
-
 def _full(px: Array, small: Camera, full: Camera) -> Array:
     """Places (n, 2) of a reduced photo in px of the full one."""
     scale = max(full.width, full.height) / max(small.width, small.height)
     return np.asarray((px + 0.5) * scale - 0.5)
-
-
-def _at(pair: Together, px_a: Array) -> Array:
-    """(n,) 1 over the depth at places (n, 2) of a map's photo, between nodes; that of the rim
-    beyond it.
-    """
-    rows, columns = pair.nearness.shape
-    last = np.array([columns - 1, rows - 1])
-    size = np.array([pair.camera_a.width - 1, pair.camera_a.height - 1])
-    node = np.clip(np.nan_to_num(px_a) / size * last, 0, last)
-    found = map_coordinates(pair.nearness, node[:, ::-1].T, order=1, mode="nearest")
-    return np.asarray(found, np.float64)
-
-
-def _seen(
-    pair: Together, beside: _Beside, small: Camera, shape: tuple[int, int]
-) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-    """The photo of the map as the reduced band (h, w) sees it, and where it shows anything."""
-    h, w = shape
-    rows, columns = (np.arange(0, n + _NODE, _NODE, dtype=np.float64) for n in (h, w))
-    x, y = np.meshgrid(columns, rows)
-    there = beside.in_photo(np.c_[x.ravel(), y.ravel()], small, pair)[0].reshape(*x.shape, 2)
-    scale = max(pair.a.shape) / max(pair.camera_a.width, pair.camera_a.height)
-    there = ((there + 0.5) * scale - 0.5).astype(np.float32)
-    # nodes of an enlarged image, whose corners lie at the first and the last node
-    map_x, map_y = np.meshgrid(
-        np.arange(w, dtype=np.float32) / _NODE, np.arange(h, dtype=np.float32) / _NODE
-    )
-    u, v = (
-        cv2.remap(np.ascontiguousarray(there[..., k]), map_x, map_y, cv2.INTER_LINEAR)
-        for k in (0, 1)
-    )
-    source: NDArray[Any] = pair.a
-    finer = max(pair.a.shape) / max(h, w) / 1.1
-    if finer > 1.5:  # as fine as the band, or fine structure would be aliased
-        source = cv2.GaussianBlur(pair.a, (0, 0), 0.4 * finer)
-    seen = cv2.remap(source, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    height, width = pair.a.shape
-    valid = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
-    return seen.astype(np.float32), valid
 
 
 def _shifts(a: Orientation, b: Orientation, reach: int, apart: float) -> tuple[Array, Array]:
@@ -369,9 +274,7 @@ def _shifts(a: Orientation, b: Orientation, reach: int, apart: float) -> tuple[A
         np.linspace(0, n - side, 1 + ceil((n - side) / (apart * side))).astype(int)
         for n in (height, width)
     )
-    fields = cv2.copyMakeBorder(
-        a.fields, reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=(0,) * 4
-    )
+    fields = padded(a.fields, reach)
     both, found = a.valid * b.valid, []
     for top, left in itertools.product(tops, lefts):
         part = (slice(top, top + side), slice(left, left + side))
@@ -385,7 +288,7 @@ def _shifts(a: Orientation, b: Orientation, reach: int, apart: float) -> tuple[A
     return table[:, :2], table[:, 2:]
 
 
-def _off(found: _Matched, there: _Beside) -> Array:
+def _off(found: _Matched, there: Beside) -> Array:
     """(n,) distance in px of the band between places and where a camera has them."""
     px = there.sees(rays(found.camera_a, found.px_a), found.nearness)
     return np.asarray(np.linalg.norm(px - found.px_b, axis=1))
