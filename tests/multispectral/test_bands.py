@@ -8,13 +8,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from skyquilt.model.camera import Camera
 from skyquilt.model.photo import GeoPosition
 from skyquilt.model.poses import Pose
 from skyquilt.multispectral import captures
 from skyquilt.multispectral.captures import bands_of_files, captured_together
 from skyquilt.multispectral.draw import BandsDrawing, averaged
 from skyquilt.multispectral.indices import INDICES, indices_of
-from skyquilt.multispectral.placing import _far, _weaker
+from skyquilt.multispectral.placing import _far, _like, _weaker
 from skyquilt.multispectral.reflectance import common_kind
 from skyquilt.photos.band_tags import BandTags
 from skyquilt.photos.together import SECONDS, nearest_in_time
@@ -200,3 +201,15 @@ def test_few_blocks_of_many_bands_are_in_memory():
     found = drawing._few_at_a_time(lambda b: b.col0, todo, SimpleNamespace(each=each))
     assert list(found) == [64 * k for k in range(10)]
     assert asked == [4, 4, 2]
+
+
+def test_a_guessed_focal_length_is_that_of_the_maps_camera():
+    """Of files of one size; those of a smaller camera, or with a calibration, tell their own."""
+    one = photo("a.tif")
+    guessed = replace(one, calibration=None, focal=replace(one.focal, px=800.0, source="guess"))
+    found = Camera.ideal(width=one.width, height=one.height, focal=600.0)
+    assert _like(guessed, guessed, found).focal == 600
+    small = replace(guessed, width=one.width // 2)
+    assert _like(small, guessed, found).focal == 800
+    told = replace(guessed, focal=replace(one.focal, px=800.0, source="sensor"))
+    assert _like(told, guessed, found).focal == 800

@@ -34,7 +34,7 @@ def told(tmp_path_factory):
                 sigma = (blurred or {}).get(name, 0)
                 counts = cv2.GaussianBlur(counts, (0, 0), sigma) if sigma else counts
                 file = f"{shot}_{name.replace(' ', '')}.tif"
-                counts = cv2.blur(counts, (9, 1)) if file == shaken else counts
+                counts = cv2.blur(counts, (15, 1)) if file == shaken else counts
                 path = dji(folder / file, counts.astype(np.uint16), BandName=name)
                 photo, tags = read_photo(path), tags_of(read_photo(path))
                 convert = Reflectance.of(tags, photo.width, photo.height)

@@ -233,6 +233,22 @@ def test_a_band_of_other_captures_is_left_out(bare, tmp_path):
     assert [b["name"] for b in told["shown"]] == ["green", "red", "red edge", "nir"]
 
 
+def test_where_no_band_lies_on_the_map_it_is_finished_and_told(flown, bare, tmp_path):
+    """Photos in colours, and two files of a band, which are too few to find its camera."""
+    shutil.copytree(flown / "photos", tmp_path / "photos")
+    for path in sorted(bare.glob("*_MS_NIR.TIF"))[:2]:
+        shutil.copy(path, tmp_path / "photos")
+    (tmp_path / "out").mkdir()
+    *before, last = iter_bands(tmp_path / "photos", tmp_path / "out", SETTINGS)
+    texts = [e.text for e in before if isinstance(e, Note) and e.warning]
+    assert "No band lies on the map, so there is no bands.tif." in texts
+    assert last.metrics["bands"]["shown"] == [] and "nir" in last.metrics["bands"]["refused"]
+    assert (tmp_path / "out" / "mosaic.tif").exists()
+    assert not (tmp_path / "out" / "bands.tif").exists()
+    assert "No band lies on the map." in (tmp_path / "out" / "report.html").read_text("utf-8")
+    assert with_bands(last).endswith("bands:  none")
+
+
 def test_photos_without_bands_are_refused(flown, tmp_path):
     with pytest.raises(UsageError, match="--all-bands needs files that each show one band"):
         list(iter_bands(flown / "photos", tmp_path / "out", SETTINGS))

@@ -478,6 +478,8 @@ def with_bands(result: "Result") -> str:
     from skyquilt.cli.progress import mosaic_summary
 
     told = result.metrics["bands"]
+    if not told["shown"]:
+        return f"{mosaic_summary(result)}\nbands:  none"
     names = ", ".join(b["name"] for b in told["shown"])
     more = "".join(f", {name}" for name in told["files"] if name != "bands.tif")
     return (

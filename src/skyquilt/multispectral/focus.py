@@ -18,9 +18,9 @@ _FEWEST = 3
 _UNSHARP = 0.33
 """Share of the fine detail of other bands below which a band is told: a blur of 1 px (standard
 deviation). Sharp bands of one rig differ by a third at most."""
-_SHAKEN = 0.2
-"""The same of a file against the others of its band; over water, whose waves move, they differ by
-a half."""
+_SHAKEN = 0.1
+"""The same of a file against the others of its band; over water, which has no fine detail, they
+differ by a factor of 6."""
 
 
 def relative_detail(

@@ -12,7 +12,7 @@ from skyquilt.coregistration.page import picture
 from skyquilt.model.photo import RejectedPhoto
 from skyquilt.multispectral.composite import INFRARED, composed, ends_of, reduced
 from skyquilt.multispectral.draw import BANDS_FILE, PlacedBand
-from skyquilt.multispectral.indices import INDICES, Index
+from skyquilt.multispectral.indices import INDICES, Index, indices_of
 from skyquilt.multispectral.placing import Placing, left_out
 from skyquilt.raster.colours import coloured
 from skyquilt.report.numbers import DASH, fixed, number, plain
@@ -44,18 +44,14 @@ _COMPOSITES = (
 
 
 def band_figures(
-    bands: Sequence[PlacedBand],
-    placed: Placing,
-    lost: Sequence[RejectedPhoto],
-    kind: str,
-    indices: Sequence[str],
+    bands: Sequence[PlacedBand], placed: Placing, lost: Sequence[RejectedPhoto]
 ) -> dict[str, Any]:
     """The entry `bands` of metrics.json."""
     return {
-        "values": kind,
+        "values": placed.kind,
         "shown": [_figures(b) for b in bands],
         "refused": placed.refused,
-        "indices": list(indices),
+        "indices": [index.name for index in indices_of([b.files.name for b in bands])],
         "photos_rejected": {p.name: p.reason for p in lost},
         "notes": [
             *placed.notes[len(placed.refused) :],
@@ -95,7 +91,7 @@ def _figures(band: PlacedBand) -> dict[str, Any]:
 
 def write_section(output: Path, record: Mapping[str, Any]) -> None:
     """Adds a section to the report, from the entry `bands` of metrics.json."""
-    add_section(output, bands_section(record, pictures_of(output)))
+    add_section(output, bands_section(record, pictures_of(output) if record["shown"] else []))
 
 
 def pictures_of(output: Path) -> list[tuple[NDArray[np.uint8], str, str]]:
@@ -138,7 +134,8 @@ def bands_section(
     record: Mapping[str, Any], pictures: Sequence[tuple[NDArray[np.uint8], str, str]]
 ) -> Section:
     """The section from the entry `bands` of metrics.json, and its pictures."""
-    blocks: list[Block] = [_table(record["shown"]), *(picture(*p) for p in pictures)]
+    blocks: list[Block] = [_table(record["shown"])] if record["shown"] else []
+    blocks += [picture(*p) for p in pictures]
     said = [f"The band {n} is left out: {why}." for n, why in record["refused"].items()]
     files = [RejectedPhoto(name=n, reason=why) for n, why in record["photos_rejected"].items()]
     said += [f"{sentence}." for sentence in left_out(files)]
@@ -146,7 +143,10 @@ def bands_section(
     if said:
         blocks.append(Sentences(items=tuple(said)))
     return Section(
-        id="bands", title="Bands", lead=_VALUES[str(record["values"])], blocks=tuple(blocks)
+        id="bands",
+        title="Bands",
+        lead=_VALUES[str(record["values"])] if record["shown"] else "No band lies on the map.",
+        blocks=tuple(blocks),
     )
 
 

@@ -176,10 +176,23 @@ def _rig(scene: Scene, band: BandFiles, of_photo: dict[int, int]) -> BandRig | R
     pairs = _far(scene, pairs)
     asked = [pairs[k] for k in evenly(len(pairs), MOST_PAIRS)]
     seen = [t for i, j in asked if (t := _together(scene, i, band.photos[j])) is not None]
-    first = band.photos[pairs[0][1]] if pairs else None
-    camera = Camera.ideal(width=1, height=1, focal=1.0) if first is None else first.lens
-    sigma = 0.0 if first is None else first.focal.sigma_px / first.focal.px
-    return FindBandRig()(seen, camera, sigma)
+    if not pairs:
+        return FindBandRig()(seen, Camera.ideal(width=1, height=1, focal=1.0), 0.0)
+    (i, j), *_ = pairs
+    first = band.photos[j]
+    camera = _like(first, aligned.photos[i], alignment.camera(i))
+    return FindBandRig()(seen, camera, first.focal.sigma_px / first.focal.px)
+
+
+def _like(first: Photo, other: Photo, found: Camera) -> Camera:
+    """What is known of the camera of a band's file beside a photo of the map whose camera was found
+    so. Of cameras of one size whose focal lengths are guessed, or told in one way, one is off by
+    about as much as the other.
+    """
+    alike = (first.width, first.height) == (other.width, other.height)
+    if not alike or first.focal.source != other.focal.source or first.calibration is not None:
+        return first.lens
+    return replace(first.lens, focal=first.lens.focal * found.focal / other.focal.px)
 
 
 def _far(scene: Scene, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:

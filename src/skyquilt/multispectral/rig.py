@@ -109,7 +109,7 @@ class FindBandRig:
     """
     minimum: int = 3
     """Fewest pairs of photos."""
-    sure: float = 0.9
+    sure: float = 0.7
     """Share of the patches that agree from which nothing better is looked for."""
     sigma_m: float = 0.05
     """Standard deviation of the distance in m between two cameras along either axis."""

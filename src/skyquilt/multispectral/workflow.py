@@ -24,7 +24,7 @@ from skyquilt.multispectral.composite import INFRARED_FILE, write_infrared
 from skyquilt.multispectral.draw import BANDS_FILE, BandsDrawing, PlacedBand
 from skyquilt.multispectral.indices import indices_of
 from skyquilt.multispectral.page import band_figures, write_section
-from skyquilt.multispectral.placing import left_out, place_bands
+from skyquilt.multispectral.placing import Placing, left_out, place_bands
 from skyquilt.multispectral.reflectance import Kind
 from skyquilt.multispectral.rig import FindBandRig
 from skyquilt.outside import remove_file
@@ -96,8 +96,30 @@ def _bands(made: FinishedMap, others: Sequence[Photo]) -> Generator[Event, None,
         return
     placing = place_bands(scene, others, clock.workers)
     placed = yield from clock.stage("rig", placing, keeps=False)
-    bands, lost = placed.bands, placed.lost
     yield from (Note(text=t, warning=True) for t in (*placed.notes, *left_out(placed.lost)))
+    bands, lost, made_files = yield from _drawn(made, scene, placed, clock, key)
+    for name in {*ADDED} - {*made_files, THERMAL_FILE}:  # of an earlier run with other bands
+        remove_file(output / name)
+    files = _stamps(output, made_files)
+    told = band_figures(bands, placed, lost)
+    final = placed.final and len(lost) == len(placed.lost)
+    figures = {"bands": told | {"key": key if final else "", "files": files}}
+    metrics = {**made.result.metrics, **figures}
+    write_section(output, figures["bands"])
+    write_figures(output, metrics)
+    yield Result(output=output, metrics=metrics)
+
+
+def _drawn(
+    made: FinishedMap, scene: Scene, placed: Placing, clock: Clock, key: str
+) -> Generator[Event, None, tuple[list[PlacedBand], list[RejectedPhoto], list[str]]]:
+    """Draws the rasters: the bands they show, what was left out, and the names of the files; none
+    where no band has a place.
+    """
+    output, bands, lost = made.result.output, placed.bands, placed.lost
+    if not bands:
+        yield Note(text=f"No band lies on the map, so there is no {BANDS_FILE}.", warning=True)
+        return [], lost, []
     while True:
         drawing = _drawing(made, scene, bands, placed.kind, clock, key)
         try:
@@ -107,19 +129,8 @@ def _bands(made: FinishedMap, others: Sequence[Photo]) -> Generator[Event, None,
             bands = [b.without(error.photo) for b in bands]
             lost = [*lost, RejectedPhoto(name=error.photo, reason=error.reason)]
             yield Note(text=f"{error.photo} is left out: {error.reason}", warning=True)
-    values, indices = drawing.tags["VALUES"], [i.name for i in drawing.indices]
-    made_files = [BANDS_FILE, *(f"{name}.tif" for name in indices)]
-    made_files += [INFRARED_FILE] if write_infrared(output) else []
-    for name in {*ADDED} - {*made_files, THERMAL_FILE}:  # of an earlier run with other bands
-        remove_file(output / name)
-    files = _stamps(output, made_files)
-    told = band_figures(bands, placed, lost, values, indices)
-    final = placed.final and len(lost) == len(placed.lost)
-    figures = {"bands": told | {"key": key if final else "", "files": files}}
-    metrics = {**made.result.metrics, **figures}
-    write_section(output, figures["bands"])
-    write_figures(output, metrics)
-    yield Result(output=output, metrics=metrics)
+    files = [BANDS_FILE, *(f"{index.name}.tif" for index in drawing.indices)]
+    return bands, lost, files + ([INFRARED_FILE] if write_infrared(output) else [])
 
 
 def _key(made: FinishedMap, scene: Scene, others: Sequence[Photo]) -> str:
