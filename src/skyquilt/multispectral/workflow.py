@@ -62,7 +62,8 @@ def iter_bands(
     if not others:
         raise UsageError(
             "--all-bands needs files that each show one band of a multispectral camera and say so"
-            " (BandName in their XMP); these do not"
+            " (BandName in their XMP); these do not. Files that hold several bands each, as MAPIR's"
+            " do, are mapped without it: mosaic.tif has their bands"
         )
     made = yield from make_map(
         _without_reasons(given, others),
