@@ -8,6 +8,7 @@ from skyquilt.errors import UsageError
 from skyquilt.model.photo import Survey
 from skyquilt.photos.left_out import NAMELESS, band_note, of_one_band
 from skyquilt.photos.read import read_photo
+from skyquilt.photos.survey import survey_notes
 from tests.alignment.surveys import photo
 
 
@@ -30,6 +31,15 @@ def test_one_band_is_kept_and_the_others_are_named(wanted, shown):
     assert all(f"the map shows {shown}" in r.reason for r in kept.rejected)
     (note,) = band_note(FIVE.photos)
     assert "red edge (3)" in note
+
+
+def test_a_thermal_band_of_a_rig_is_no_mixture_of_spectra():
+    """The Altum has one; a thermal camera of its own beside photos in colours is told."""
+    heat = [replace(band("lwir", k), band="thermal") for k in range(3)]
+    other = [replace(p, band_name="") for p in heat]
+    colours = [photo(f"{k}.jpg") for k in range(3)]
+    assert not any("spectra are mixed" in n for n in survey_notes([*FIVE.photos, *heat]))
+    assert any("spectra are mixed" in n for n in survey_notes([*colours, *other]))
 
 
 def test_the_band_of_most_photos_is_shown():

@@ -287,7 +287,7 @@ def _notes(band: PlacedBand) -> list[str]:
     off = max((r.off_px for r in band.rigs.values()), default=0.0)
     if off > _FAR_PX:
         found.append(
-            f"The band {name} lies {off:.1f} px off the map's in the median: its indices are wrong"
-            " at edges."
+            f"The band {name} lies {off:.1f} px off the map's in the median: it is wrong at edges"
+            f"{'' if name == THERMAL else ', and so are its indices'}."
         )
     return found

@@ -283,7 +283,7 @@ def _cameras(photos: Sequence[Photo]) -> Iterator[str]:
     if len(keys) > 1:
         listed = sentence_of([f"{key} ({n})" for key, n in keys.items()])
         yield f"There are {len(keys)} cameras: {listed}; each is calibrated separately."
-    bands = Counter(p.band for p in photos)
+    bands = Counter(p.band for p in photos if not p.shows_a_band)  # those of a rig are told apart
     if len(bands) > 1:
         counts = " and ".join(f"{n} {band}" for band, n in sorted(bands.items()))
         yield f"Different spectra are mixed: {counts} photos."
