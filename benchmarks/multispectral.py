@@ -1,9 +1,11 @@
 """Bands of simulated multispectral flights against their truth.
 
-    python benchmarks/multispectral.py WORK [--seeds 1 2 3]
+    python benchmarks/multispectral.py WORK [--flight landscape] [--seeds 1 2 3]
 
 Each flight (`skyquilt simulate --multispectral --rtk`, 15 captures of five bands of 720 x 540 px,
 cameras 3 cm apart and turned against each other by half a degree) is mapped with `--all-bands`.
+Other flights than `landscape` have cameras 8 cm apart (`low`: at 30 m; `slope`: a mountain side;
+`cliff`), or turned against each other by some 4 degrees (`knocked`).
 Printed are, per flight: how far a band lies beside the green one in windows of 64 px (median and
 nine of ten, map px: the displacement of each from the truth by phase correlation, less that of the
 green band, scatter of the correlation included); the largest relative difference of a band's
@@ -31,24 +33,36 @@ from skyquilt.model.event import StageFinished
 from skyquilt.multispectral.workflow import iter_bands
 from skyquilt.settings import MosaicSettings
 from skyquilt.simulate import FlightSettings, simulate
+from skyquilt.simulate.scene import SceneSettings
 from skyquilt.simulate.settings import Multispectral, Reporting, Route
+from skyquilt.simulate.terrain import Terrain
 
+FLIGHTS: dict[str, tuple[Terrain, float, float, float]] = {
+    "landscape": ("landscape", 60.0, 0.03, 0.4),
+    "low": ("landscape", 30.0, 0.08, 0.4),
+    "slope": ("slope", 110.0, 0.08, 0.4),
+    "cliff": ("cliff", 95.0, 0.08, 0.4),
+    "knocked": ("landscape", 60.0, 0.05, 4.0),
+}
+"""Terrain, height in m, distance of the cameras in m, and the angle that they are turned by."""
 WINDOW = 64
 LEAST_RESPONSE = 0.3
 """Windows whose phase correlation has a lower peak tell nothing."""
 
 
-def flown(folder: Path, seed: int) -> None:
+def flown(folder: Path, seed: int, kind: str = "landscape") -> None:
     """Simulates a flight, unless it is there."""
     if (folder / "truth" / "truth.json").exists():
         return
     lens = FlightSettings().lens.scaled(1200, 900)
+    terrain, height, apart_m, turned_deg = FLIGHTS[kind]
     settings = FlightSettings(
         seed=seed,
         lens=lens,
-        route=Route(photos=15),
+        scene=SceneSettings(kind=terrain),
+        route=Route(photos=15, height=height),
         reporting=Reporting(rtk=True, gps_noise=0.02),
-        multispectral=Multispectral(width=720, height=540),
+        multispectral=Multispectral(width=720, height=540, apart_m=apart_m, turned_deg=turned_deg),
     )
     for _ in simulate(settings, folder, overwrite=True):
         pass
@@ -131,12 +145,14 @@ def main() -> None:
     """Prints the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("work", type=Path)
+    parser.add_argument("--flight", choices=FLIGHTS, default="landscape")
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
     asked = parser.parse_args()
     print(machine())
     for seed in asked.seeds:
-        flight, out = asked.work / f"flight{seed}", asked.work / f"map{seed}"
-        flown(flight, seed)
+        name = f"{asked.flight}{seed}"
+        flight, out = asked.work / name, asked.work / f"map-{name}"
+        flown(flight, seed, asked.flight)
         cpu = {}
         settings = MosaicSettings(jobs=1)
         for event in iter_bands(flight / "multispectral", out, settings, overwrite=True):

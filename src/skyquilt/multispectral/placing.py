@@ -35,8 +35,8 @@ from skyquilt.photos.pixels import read_color
 from skyquilt.workflows.flow import AlignedPhotos, Scene
 
 MOST_PAIRS = 6
-"""Captures from which the camera of a band is found, distributed over the flight; each takes two
-thirds of a second.
+"""Captures from which the camera of a band is found, distributed over the flight; each takes a
+quarter of a second.
 """
 LONGEST = 1600
 """Longest side in px of the pictures that are compared."""
