@@ -76,3 +76,13 @@ def test_columns_as_spreadsheets_write_them(tmp_path, text):
     assert (point.name, point.x, point.y, point.z) == ("p 1", 446363.45, 5160978.18, 437.678)
     ((seen,), _) = (point.observations, notes)
     assert (seen.photo, seen.x, seen.y) == ("DJI_0001.JPG", 33.1, 51.48)
+
+
+def test_points_in_files_of_another_band_are_told(tmp_path):
+    path = tmp_path / "gcp_list.txt"
+    path.write_text("EPSG:32632\n500000 5100000 400 10 10 IMG_0001_4.tif a\n")
+    names = ["IMG_0001_2.tif"], ["IMG_0001_1.tif", "IMG_0001_4.tif"]
+    with pytest.raises(SideFileError, match=r"other bands than the map's; .* \(--band\)"):
+        read_gcp_list(path, *names)
+    with pytest.raises(SideFileError, match="no photo of the survey is called that"):
+        read_gcp_list(path, names[0])

@@ -51,13 +51,14 @@ class _Observation:
 
 
 def read_gcp_list(
-    path: Path, photo_names: Iterable[str]
+    path: Path, photo_names: Iterable[str], other_bands: Iterable[str] = ()
 ) -> tuple[tuple[ControlPoint, ...], tuple[str, ...]]:
     """Control points observed in the photos of a survey, and notes on rows of photos that are not
     in it.
 
-    `photo_names` are `Photo.name`s. Raises `SideFileError` where a line is malformed, one point has
-    two positions, or no row names a photo of the survey.
+    `photo_names` are `Photo.name`s, `other_bands` those of files that show other bands than the
+    map. Raises `SideFileError` where a line is malformed, one point has two positions, or no row
+    names a photo of the survey.
     """
     lines = read_lines(path)
     if len(lines) < 2:
@@ -73,6 +74,12 @@ def read_gcp_list(
     names = PhotoNames(photo_names)
     strangers = sorted({s.image for s in observations if names.find(s.image) is None})
     if all(names.find(s.image) is None for s in observations):
+        others = PhotoNames(other_bands)
+        if any(others.find(s.image) is not None for s in observations):
+            raise SideFileError(
+                f"{path.name} names files of other bands than the map's; observe the points in"
+                " files of the map's band, or make theirs the map (--band)."
+            )
         raise SideFileError(
             f"{path.name} names {sentence_of(strangers)}; no photo of the survey is called that. "
             "Correct the image names in its sixth column."

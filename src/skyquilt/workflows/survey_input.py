@@ -189,7 +189,8 @@ def completed(given: SurveyInput, settings: InputSettings) -> SurveyInput:
     gcp = given.control_file(settings.gcp)
     control: tuple[ControlPoint, ...] = ()
     if gcp is not None:
-        control, notes = read_gcp_list(gcp, names)
+        others = [p.name for p in survey.other_bands]
+        control, notes = read_gcp_list(gcp, names, others)
         check_control(gcp, control, survey.photos)
         survey = replace(survey, notes=(*survey.notes, *notes))
     known = settings.distances
