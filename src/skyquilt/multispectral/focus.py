@@ -20,7 +20,7 @@ _UNSHARP = 0.33
 deviation). Sharp bands of one rig differ by a third at most."""
 _SHAKEN = 0.1
 """The same of a file against the others of its band; over water, which has no fine detail, they
-differ by a factor of 6."""
+differ by a factor of 4."""
 
 
 def relative_detail(

@@ -5,12 +5,13 @@ would tell: a black file of the near infrared would make an NDVI of -1.
 """
 
 import math
-import warnings
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from skyquilt.imaging.grey import detail, to_grey8
+from skyquilt.imaging.grey import detail
 from skyquilt.model.photo import Photo
 from skyquilt.multispectral.reflectance import Reflectance
 from skyquilt.photos.pixels import lost, read_color
@@ -61,7 +62,14 @@ def look_at(item: tuple[Photo, Reflectance]) -> Recorded:
         median, bright = np.percentile(known, (50, 99)) - convert.black_level
         if median < _DARK * convert.full and bright < _BRIGHT * convert.full:
             return Recorded(reason="it is black: nothing in it is brighter than its black level")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # all cells of a small file are NaN
-        fine = np.nanmedian(detail(to_grey8(pixels))[..., :2], axis=(0, 1)).min()
-    return Recorded(saturated=saturated, detail=float(fine))
+    return Recorded(saturated=saturated, detail=_detail(pixels, known))
+
+
+def _detail(pixels: NDArray[Any], known: NDArray[np.float32]) -> float:
+    """Logarithm of fine over coarse detail of counts (h, w[, 1]); `known`: a sample of them."""
+    low, high = np.percentile(known, (1, 99))
+    scaled = (pixels.astype(np.float32) - low) * np.float32(255 / max(high - low, 1e-6))
+    grey = np.clip(np.nan_to_num(scaled, nan=0.0), 0, 255).astype(np.uint8)
+    cells = detail(grey)[..., :2]
+    known_cells = cells[np.isfinite(cells).all(-1)]
+    return float(np.median(known_cells, axis=0).min()) if len(known_cells) else math.nan
