@@ -97,8 +97,8 @@ class FindBandRig:
     """Largest shift in px at that resolution that is looked for."""
     apart: tuple[float, ...] = (1.0, 1.0, 1.0, 0.7)
     """Sides of a patch between neighbours, at most."""
-    share: tuple[float, ...] = (0.5, 0.5, 1.0, 1.0)
-    """Share of the pairs that are matched: the first rounds find little but the rotation."""
+    share: tuple[float, ...] = (0.5, 0.5, 0.5, 1.0)
+    """Share of the pairs that are matched: what a round finds, the next ones improve."""
     scatter_px: float = 0.3
     """Scatter of a match in px of a reduced photo, beyond which its weight falls."""
     agree_px: float = 1.0
@@ -109,8 +109,9 @@ class FindBandRig:
     """
     minimum: int = 3
     """Fewest pairs of photos."""
-    sure: float = 0.7
-    """Share of the patches that agree from which nothing better is looked for."""
+    sure_px: float = 0.08
+    """Median distance in px of a reduced photo of all patches from the rig up to which nothing
+    better is looked for."""
     sigma_m: float = 0.05
     """Standard deviation of the distance in m between two cameras along either axis."""
     version: ClassVar[int] = 3
@@ -131,13 +132,14 @@ class FindBandRig:
         straight = Beside(turn=np.zeros(3), place=np.zeros(2), camera=camera_b)
         fields = cache(lambda k, side: oriented(pairs[k].b, side))
         best = self._from(straight, pairs, fields, sigma_focal)
-        if best is None or best[2].mean() < self.sure:
+        if best is None or np.median(best[2]) > self.sure_px:
             other = self._from(turned(pairs, straight), pairs, fields, sigma_focal)
-            if other is not None and (best is None or other[2].mean() > best[2].mean()):
+            if other is not None and (best is None or np.median(other[2]) < np.median(best[2])):
                 best = other
         if best is None:
             return RefusedRegistration(reason="its photos and the map's have nothing in common")
-        there, found, agree = best
+        there, found, off = best
+        agree = off < self.agree_px
         if agree.mean() < self.least_share:
             return RefusedRegistration(
                 reason=f"{agree.mean():.0%} of the patches of its photos agree on one camera beside"
@@ -159,10 +161,10 @@ class FindBandRig:
         pairs: Sequence[Together],
         fields: Callable[[int, int], Orientation],
         sigma_focal: float,
-    ) -> tuple[Beside, _Matched, NDArray[np.bool_]] | None:
-        """The camera that is found from a first one, the patches of the last round, and which of
-        them agree; None where none were matched. `fields`: those of the band's photo of a pair,
-        reduced to a side.
+    ) -> tuple[Beside, _Matched, Array] | None:
+        """The camera that is found from a first one, the patches of the last round, and how far
+        they are off in px of a reduced photo; None where none were matched. `fields`: those of the
+        band's photo of a pair, reduced to a side.
         """
         told = there.camera
         rounds = zip(self.sides, self.reach, self.apart, strict=True)
@@ -173,7 +175,8 @@ class FindBandRig:
             if not len(found.px_a):
                 return None
             there = self._fitted(found, there, told, step, sigma_focal)
-        return there, found, _off(found, there) / _scale(told, self.sides[-1]) < self.agree_px
+        off = _off(found, there) / _scale(told, self.sides[-1])
+        return there, found, np.nan_to_num(off, nan=np.inf)
 
     def _matched(
         self,
