@@ -201,14 +201,13 @@ def test_of_two_photos_none_may_be_lost(flight, tmp_path):
     assert any(b.name in note and "is gone" in note for note in notes)
 
 
-def test_what_tells_no_height_is_refused(flight, tmp_path):
-    one, *_, last = sorted((flight / "photos").glob("*.jpg"))
+def test_what_tells_no_height_is_refused(small_flight, tmp_path):
+    one, *_, last = far = sorted((small_flight / "photos").glob("*.jpg"))
     with pytest.raises(UsageError, match="at least two photos"):
         list(iter_depth([one], tmp_path / "a"))
     with pytest.raises(UsageError, match="--route 'guess'"):
         list(iter_depth([one, last], tmp_path / "a", route="guess"))
-    far = sorted((flight / "photos").glob("*.jpg"))
-    noise = np.random.default_rng(0).integers(0, 255, (600, 800, 3), np.uint8)
+    noise = np.random.default_rng(0).integers(0, 255, (360, 480, 3), np.uint8)
     cv2.imwrite(str(tmp_path / "noise.jpg"), noise)
     with pytest.raises(RefusedError, match="of the first two: they do not match"):
         depth([far[0], tmp_path / "noise.jpg"], tmp_path / "b", SETTINGS)
