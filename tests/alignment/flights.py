@@ -31,7 +31,14 @@ class Flight:
     features: list
     west: float
     north: float
-    ground: np.ndarray
+    size: tuple[int, int]
+    """Cells of the ground down and across."""
+    seed: int
+
+    @property
+    def ground(self):
+        """Grey values of the ground's cells; not every test looks at it."""
+        return texture(*self.size, seed=self.seed, roughness=1.2)
 
     def grey(self, i, longest):
         """The picture of photo i."""
@@ -89,7 +96,7 @@ def fly(
     X = np.column_stack([rng.uniform(low, high, (points, 2)), np.zeros(points)])
     X[: points // 10, 2] = relief
     words = rng.normal(size=(points, 32))
-    size = np.ceil((high - low) / CELL).astype(int)
+    extent = np.ceil((high - low) / CELL).astype(int)
     flight = Flight(
         C=C,
         R=R,
@@ -106,7 +113,8 @@ def fly(
             )
             for i in range(n)
         ],
-        ground=texture(int(size[1]), int(size[0]), seed=seed, roughness=1.2),
+        size=(int(extent[1]), int(extent[0])),
+        seed=seed,
     )
     for i in range(n):
         local = (X - C[i]) @ R[i].T

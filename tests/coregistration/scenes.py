@@ -42,9 +42,9 @@ def turned(scale, degrees, shape_a, shape_b, shift=(0.0, 0.0)):
     return np.array([[c, -s, t[0]], [s, c, t[1]], [0, 0, 1]])
 
 
-def pair(b_H_a, shape_b=(400, 480), seed=0, noise=3.0):
+def pair(b_H_a, shape_b=(400, 480), seed=0, noise=3.0, shape_a=(400, 480)):
     """Pictures a and b, 8 bits, of one layout in two spectra; b is black where a ends."""
-    labels = layout(seed=seed)
+    labels = layout(*shape_a, seed=seed)
     a = spectrum(labels, seed, noise)
     b = spectrum(labels, seed + 1, noise)
     size = (shape_b[1], shape_b[0])

@@ -62,7 +62,7 @@ def test_a_mountain_side_falls_by_thirty_degrees():
 @pytest.mark.parametrize("kind", ["cliff", "quarry", "bridge", "shore", "slope"])
 def test_a_window_has_the_heights_of_its_points(kind):
     """Cells as small as a photo's are no smoother than the shape: a wall stays a wall."""
-    ground = country(kind).ground
+    ground = Ground(noise=Noise(seed=5), relief=6.0, kind=kind)
     window = Grid(left=-8.0, top=8.0, res=0.1, width=160, height=160)
     heights = ground.heights(window)
     rng = np.random.default_rng(0)
