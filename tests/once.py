@@ -4,8 +4,10 @@ that are looked at and commands that are made once by each.
 
 import copy
 import fcntl
+import functools
 import hashlib
 import os
+import pickle
 from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -39,6 +41,25 @@ def flown_once(temporary: pytest.TempPathFactory, name: str, settings: FlightSet
 
 
 typer.main.get_command = cache(typer.main.get_command)
+
+def made_once(make):
+    """Decorates a class of scenes, whose lists of parts tests exchange parts of: what is made of the
+    same arguments again has lists of its own, and the same parts.
+    """
+    honest, made = make.__init__, {}
+
+    @functools.wraps(honest)
+    def init(self, *args, **options):
+        key = pickle.dumps((args, sorted(options.items())))
+        if key not in made:
+            honest(self, *args, **options)
+            made[key] = copy.copy(self.__dict__)
+        parts = made[key].items()
+        self.__dict__ = {k: v[:] if isinstance(v, list) else v for k, v in parts}
+
+    make.__init__ = init
+    return make
+
 
 PICTURES = 200
 """Pictures whose features are remembered, those seen last: some hundred MB."""

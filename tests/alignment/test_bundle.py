@@ -27,12 +27,14 @@ from skyquilt.model.poses import MapFrame
 from skyquilt.workflows.artefacts import REGISTRY
 from tests.alignment.blocks import HEIGHT, LENS, WIDTH, make_block, seen_by
 from tests.alignment.surveys import photo, prior
+from tests.once import made_once
 
 FRAME = MapFrame(crs="EPSG:32630", origin=(500000.0, 5600000.0), vertical_datum="takeoff")
 SLOW = pytest.mark.slow
 LOCAL = MapFrame(crs=None, origin=(0.0, 0.0), vertical_datum="takeoff")
 
 
+@made_once
 class Flown:
     """A simulated block as photos, priors, features and links."""
 

@@ -25,11 +25,13 @@ from skyquilt.model.camera import Camera
 from skyquilt.model.features import Features, Link, Matches
 from skyquilt.model.poses import MapFrame, Pose
 from tests.alignment.surveys import FOCAL, HEIGHT, WIDTH, photo, prior
+from tests.once import made_once
 
 FRAME = MapFrame(crs="EPSG:32630", origin=(500000.0, 5600000.0), vertical_datum="takeoff")
 CAMERA = Camera.ideal(width=WIDTH, height=HEIGHT, focal=FOCAL)
 
 
+@made_once
 class Slanting:
     """Photos with known poses over rough ground, reported with errors of receivers."""
 

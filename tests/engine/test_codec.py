@@ -89,13 +89,13 @@ def same(a: Any, b: Any) -> bool:
     return a == b
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(VALUES)
 def test_what_goes_in_comes_out(value):
     assert same(value, decode(encode(value), REGISTRY))
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(LEAVES, st.data())
 def test_torn_bytes_are_a_value_error(leaf, data):
     whole = encode(leaf)
@@ -104,7 +104,7 @@ def test_torn_bytes_are_a_value_error(leaf, data):
         decode(torn, REGISTRY)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(LEAVES, st.data())
 def test_changed_bytes_are_a_value_error_or_a_value(leaf, data):
     changed = bytearray(encode(leaf))

@@ -114,7 +114,7 @@ def test_derivatives_are_those_of_the_projection(camera, seed):
         assert exact.d_intrinsics[:, :, column] == pytest.approx(numeric, abs=1e-7 * scale)
 
 
-@settings(max_examples=200)
+@settings(max_examples=80)
 @given(cameras(), st.integers(0, 2**31))
 def test_undistortion_inverts_distortion(camera, seed):
     """Wherever the image's own pixels are (their radius may be beyond what folds: not asked of

@@ -16,15 +16,15 @@ from skyquilt.workflows.methods import methods_for
 from tests.alignment.surveys import photo
 from tests.texture import texture
 
-WIDE, HIGH = 480, 360
-STAMP = (20, 320, 440, 350)
+WIDE, HIGH = 360, 270
+STAMP = (15, 240, 330, 263)
 """Left, top, right and bottom of the text in px."""
 FIND = Sift(count=600)
 
 
 def stamped(picture, text="SKYCAM 4K  46.59N 14.29E"):
     out = np.clip(picture, 0, 255).astype(np.uint8)
-    cv2.putText(out, text, (STAMP[0], STAMP[3] - 6), 0, 0.9, 255, 2, cv2.LINE_AA)
+    cv2.putText(out, text, (STAMP[0], STAMP[3] - 5), 0, 0.7, 255, 2, cv2.LINE_AA)
     return out
 
 

@@ -62,24 +62,29 @@ def _on_ground(shot, xy):
 def photograph(shot, ground=GROUND):
     """The photo's picture: every pixel the mean of 3 x 3 rays into the ground."""
     h, w = shot.camera.height, shot.camera.width
+    R, (x, y, z) = shot.pose.cam_R_map, shot.pose.map_C
+    across, down = ground.shape[1] / 2 - 0.5, ground.shape[0] / 2 - 0.5
+    ground_H_rays = [
+        (x * R[:, 2] - z * R[:, 0]) / FINE_M + across * R[:, 2],
+        (z * R[:, 1] - y * R[:, 2]) / FINE_M + down * R[:, 2],
+        R[:, 2],
+    ]
     total = np.zeros((h, w), np.float32)
-    for plane in _sub_pixels(shot.camera):
-        xy = _on_ground(shot, plane)
-        column = (xy[:, 0] / FINE_M + ground.shape[1] / 2 - 0.5).astype(np.float32).reshape(h, w)
-        row = (ground.shape[0] / 2 - xy[:, 1] / FINE_M - 0.5).astype(np.float32).reshape(h, w)
-        total += cv2.remap(ground, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+    for rays in _sub_pixels(shot.camera):
+        column, row, far = (np.array(ground_H_rays, np.float32) @ rays).reshape(3, h, w)
+        at = column / far, row / far
+        total += cv2.remap(ground, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
     return total / 9
 
 
 @cache
 def _sub_pixels(camera):
-    """Undistorted coordinates of nine places in every pixel."""
+    """Rays (3, pixels) of nine places in every pixel."""
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     thirds = (-1 / 3, 0, 1 / 3)
+    places = [np.c_[(u + du).ravel(), (v + dv).ravel()] for du in thirds for dv in thirds]
     return [
-        undistort(camera, np.c_[(u + du).ravel(), (v + dv).ravel()])
-        for du in thirds
-        for dv in thirds
+        np.vstack([undistort(camera, px).T, np.ones(u.size)]).astype(np.float32) for px in places
     ]
 
 

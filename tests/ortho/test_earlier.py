@@ -55,7 +55,7 @@ def wanted(west, south, east, north, gsd=0.05):
 
 
 @given(st.lists(boxes, max_size=12))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=80, deadline=None)
 def test_areas_are_apart_and_hold_all_boxes(given):
     found = earlier._joined(given)
     for k, a in enumerate(found):
@@ -67,7 +67,7 @@ def test_areas_are_apart_and_hold_all_boxes(given):
 
 
 @given(boxes)
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=80, deadline=None)
 def test_a_map_grows_by_whole_tiles_and_holds_both(box):
     grid = growth().grown(wanted(*box))
     for mine, theirs in ((GRID.bounds, grid.bounds), (box, grid.bounds)):

@@ -41,7 +41,7 @@ def encoded(write):
 TIFF = encoded(lambda b: tifffile.imwrite(b, pixels(), photometric="rgb", compression="deflate"))
 PNG = encoded(lambda b: Image.fromarray(pixels()).save(b, "PNG"))
 quick = settings(
-    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 flips = st.lists(
     st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), min_size=1, max_size=30

@@ -1,5 +1,6 @@
 """Clips whose truth is known, made of a texture over which a frame moves."""
 
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -37,6 +38,7 @@ def number_of(frame) -> int:
     return sum(int(frame[100, bit * 32 + 16, 0] > 128) << bit for bit in range(9))
 
 
+@cache
 def ground(size: int = 2400):
     """A texture (size, size, 3)."""
     grey = np.clip(texture(size, size), 0, 255).astype(np.uint8)
