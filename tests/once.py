@@ -42,6 +42,7 @@ def flown_once(temporary: pytest.TempPathFactory, name: str, settings: FlightSet
 
 typer.main.get_command = cache(typer.main.get_command)
 
+
 def made_once(make):
     """Decorates a class of scenes, whose lists of parts tests exchange parts of: what is made of the
     same arguments again has lists of its own, and the same parts.

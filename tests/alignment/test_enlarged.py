@@ -33,7 +33,7 @@ def without_heights(flown):
     "factors", [(1.0, 1.4), pytest.param((1.0, 1.3, 1.7), marks=pytest.mark.slow)]
 )
 def test_photos_that_are_enlarged_are_calibrated_by_themselves(told, factors):
-    flown = Flown(1, lines=4, per_line=6, points=900, gps=0.5)
+    flown = Flown(1, lines=4, per_line=6, points=500, gps=0.5)
     each = np.resize(factors, len(flown.photos))
     enlarge(flown, each)
     if not told:
@@ -51,7 +51,7 @@ def test_photos_that_are_enlarged_are_calibrated_by_themselves(told, factors):
 
 @pytest.mark.parametrize("told", [True, False])
 def test_flights_at_two_heights_are_no_zoom(told):
-    flown = Flown(2, lines=4, per_line=6, points=900, gps=0.5, heights=(45.0, 70.0))
+    flown = Flown(2, lines=4, per_line=6, points=500, gps=0.5, heights=(45.0, 70.0))
     if not told:
         without_heights(flown)
     found = flown.aligned()

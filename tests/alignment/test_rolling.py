@@ -28,7 +28,7 @@ LENS = Lens(width=1600, height=1200, aspect=1.002, readout=0.030)
 SPEED = 10.0
 
 
-def shots(seed=0, *, fixed_yaw=True, turns=0.0, photos=24, lens=LENS):
+def shots(seed=0, *, fixed_yaw=True, turns=0.0, photos=18, lens=LENS):
     route = Route(
         photos=photos, height=40.0, speed=SPEED, fixed_yaw=fixed_yaw, turns=turns, tilt_noise=1.0
     )
@@ -45,7 +45,7 @@ def block(seed=0, *, noise=0.1, lens=LENS, **options):
     rng = np.random.default_rng(seed)
     flown = shots(seed, lens=lens, **options)
     C = np.array([s.centre for s in flown])
-    xy = rng.uniform(C[:, :2].min(0) - 15, C[:, :2].max(0) + 15, (900, 2))
+    xy = rng.uniform(C[:, :2].min(0) - 15, C[:, :2].max(0) + 15, (600, 2))
     X = np.column_stack([xy, 2 * np.sin(xy[:, 0] / 9) + rng.uniform(0, 3, len(xy))])
     rows = []
     for i, shot in enumerate(flown):
@@ -105,7 +105,7 @@ def test_points_are_found_from_moving_cameras():
 
 def test_the_readout_is_determined_where_lines_go_both_ways_without_turning():
     errors = []
-    for seed in range(4):
+    for seed in range(3):
         problem, truth, _ = block(seed)
         start = replace(truth, C=problem.C0, K=problem.K0.copy())
         found = adjust(problem, start, iterations=40, tolerance=1e-9).state
@@ -116,11 +116,11 @@ def test_the_readout_is_determined_where_lines_go_both_ways_without_turning():
 
 
 def test_noise_of_observations_does_not_lengthen_the_readout():
-    """An error of 1 px moves the observed row as well. With residuals from there all four readouts
+    """An error of 1 px moves the observed row as well. With residuals from there all readouts
     were 3 to 7 deviations too long.
     """
     errors = []
-    for seed in range(4):
+    for seed in range(2):
         problem, truth, _ = block(seed, noise=1.0, fixed_yaw=False)
         start = replace(truth, C=problem.C0, K=problem.K0.copy())
         found = adjust(problem, start, iterations=40, tolerance=1e-9).state

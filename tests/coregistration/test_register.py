@@ -56,7 +56,9 @@ def test_the_record_tells_the_transform(done):
     assert error(np.array(record["b_H_a"]), TRUTH, SHAPE) < 0.3
     assert record["inliers"] == record["evidence"]["patches_agreeing"] >= 9
     assert 0.2 < record["q"] <= 1 and 0 < record["residual_px"] < 2
-    assert error(np.array(record["b_H_a"]), TRUTH, SHAPE) < record["error_px"] < record["tolerance_px"]
+    assert (
+        error(np.array(record["b_H_a"]), TRUTH, SHAPE) < record["error_px"] < record["tolerance_px"]
+    )
     assert max(c[2] for c in record["error_corners"]) == record["error_px"]
     assert record["valid_area"]["share"] == 1 and len(record["valid_area"]["polygon"]) >= 4
     assert sorted(p.name for p in output.iterdir()) == sorted(CONTRACT)

@@ -15,7 +15,8 @@ from skyquilt.live.settings import LiveSettings
 @pytest.fixture(scope="module")
 def live(flight, tmp_path_factory):
     """Four photos; the second one's metadata have not been read in the map's frame."""
-    live = LiveMap(tmp_path_factory.mktemp("live") / "out", LiveSettings(features=600, deterministic=True))
+    settings = LiveSettings(features=600, deterministic=True)
+    live = LiveMap(tmp_path_factory.mktemp("live") / "out", settings)
     for path in flight.photos[:4]:
         live.add(path)
     second = live.members.by_id[2]
