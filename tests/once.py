@@ -44,8 +44,8 @@ typer.main.get_command = cache(typer.main.get_command)
 
 
 def made_once(make):
-    """Decorates a class of scenes, whose lists of parts tests exchange parts of: what is made of the
-    same arguments again has lists of its own, and the same parts.
+    """Decorates a class of scenes: one that is made of the same arguments again has the same parts,
+    in lists of its own, for tests that exchange some.
     """
     honest, made = make.__init__, {}
 

@@ -90,13 +90,13 @@ def test_a_block_that_leans_moves_what_stands_up():
 
 def test_level_ground_tells_no_place():
     rng = np.random.default_rng(5)
-    a, b = (field(rng.normal(0, 0.05, (SIZE, SIZE))) for _ in "ab")
+    a, b = (field(rng.normal(0, 0.05, (240, 240))) for _ in "ab")
     found = AlignHeights()(a, b, start())
     assert isinstance(found, RefusedRegistration) and "unrelated" in found.reason
 
 
 def test_other_ground_tells_no_place():
-    found = AlignHeights()(field(ground(6)), field(moved(ground(7))), start())
+    found = AlignHeights()(field(ground(6)[:240, :240]), field(moved(ground(7))[:240, :240]), start())
     assert isinstance(found, RefusedRegistration)
 
 

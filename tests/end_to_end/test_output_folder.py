@@ -259,14 +259,13 @@ def test_another_run_is_replaced_only_when_asked_for(mosaic, flight, again):
     assert reused == {s: s in kept for s in STAGES[1:] if s != "frames"}
 
 
-def test_the_same_run_again_does_nothing(mosaic, flight, finished):
-    output = mosaic(flight / "photos").made().output
-    times = {n: (output / n).stat().st_mtime_ns for n in CONTRACT}
+def test_the_same_run_again_does_nothing(mosaic, flight, finished, again):
+    times = {n: (again / n).stat().st_mtime_ns for n in CONTRACT}
     told = mosaic(flight / "photos", "--json").made()
     assert [e["event"] for e in told.events] == ["Note", "Result"]
     assert "nothing to do" in told.events[0]["text"]
-    assert {n: (output / n).stat().st_mtime_ns for n in CONTRACT} == times
-    same_result(output, finished)
+    assert {n: (again / n).stat().st_mtime_ns for n in CONTRACT} == times
+    same_result(again, finished)
 
 
 @pytest.mark.slow

@@ -269,8 +269,13 @@ def _road(first: str) -> set[str]:
         module = todo.pop()
         if module not in found and find_spec(module) is not None:
             found.add(module)
-            todo += _imports(_tree(module))
+            todo += _imported(module)
     return found
+
+
+@cache
+def _imported(module: str) -> list[str]:
+    return list(_imports(_tree(module)))
 
 
 def _imports(tree: ast.AST) -> Iterator[str]:
@@ -284,6 +289,7 @@ def _imports(tree: ast.AST) -> Iterator[str]:
         yield from _imports(node)
 
 
+@cache
 def _is_module(name: str) -> bool:
     try:
         return find_spec(name) is not None
