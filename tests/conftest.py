@@ -2,6 +2,7 @@
 
 import gc
 import json
+import pickle
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from skyquilt.simulate import FlightSettings
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, Route
 from skyquilt.workflows.mosaic import iter_mosaic
-from tests.once import flown_once
+from tests.once import flown_once, once_for_all
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 
@@ -58,13 +59,18 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def finished(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished:
-    """The flight's mosaic with control points."""
-    output = tmp_path_factory.mktemp("finished") / "out"
-    gcp = next(flight.rglob("gcp_list.txt"))
-    settings = MosaicSettings(gcp=gcp, jobs=2)
-    events = list(iter_mosaic(flight / "photos", output, settings))
-    assert isinstance(events[-1], Result)
-    return Finished(output=output, events=events)
+    """The flight's mosaic with control points, made once for all processes."""
+
+    def make(folder: Path) -> None:
+        settings = MosaicSettings(gcp=flight / "gcp_list.txt", jobs=2)
+        events = list(iter_mosaic(flight / "photos", folder / "out", settings))
+        assert isinstance(events[-1], Result)
+        (folder / "events").write_bytes(pickle.dumps(events))
+
+    folder = once_for_all(tmp_path_factory, "large map", make)
+    # a copy: some tests lay something beside the map for a moment
+    output = shutil.copytree(folder / "out", tmp_path_factory.mktemp("finished") / "out")
+    return Finished(output=output, events=pickle.loads((folder / "events").read_bytes()))
 
 
 LONG = ("test_large_survey", "test_windows", "test_docs")

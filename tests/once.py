@@ -1,5 +1,5 @@
-"""Flights that are simulated once for all processes that run tests beside one another, and pictures
-that are looked at and commands that are made once by each.
+"""Flights that are simulated, and maps that are made, once for all processes that run tests beside
+one another; pictures that are looked at and commands that are made once by each.
 """
 
 import copy
@@ -9,7 +9,7 @@ import hashlib
 import os
 import pickle
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -24,20 +24,28 @@ from skyquilt.model.features import Features
 from skyquilt.simulate import FlightSettings, simulate
 
 
-def flown_once(temporary: pytest.TempPathFactory, name: str, settings: FlightSettings) -> Path:
-    """Folder of a simulated flight. Other processes read it too: it is not to be changed."""
+def once_for_all(
+    temporary: pytest.TempPathFactory, name: str, make: Callable[[Path], object]
+) -> Path:
+    """A folder that is made by one process. Others read it too: it is not to be changed."""
     shared = temporary.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         shared = shared.parent
-    folder, whole = shared / "flights" / name, shared / "flights" / f"{name}.whole"
+    folder, whole = shared / "once" / name, shared / "once" / f"{name}.whole"
     folder.parent.mkdir(exist_ok=True)
     with folder.with_name(f"{name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not whole.exists():
-            for _ in simulate(settings, folder, overwrite=True):
-                pass
+            make(folder)
             whole.touch()
     return folder
+
+
+def flown_once(temporary: pytest.TempPathFactory, name: str, settings: FlightSettings) -> Path:
+    """Folder of a simulated flight, for all processes."""
+    return once_for_all(
+        temporary, name, lambda folder: list(simulate(settings, folder, overwrite=True))
+    )
 
 
 typer.main.get_command = cache(typer.main.get_command)

@@ -98,7 +98,7 @@ def test_the_fit_is_the_minimum_that_scipy_finds(free):
 
 
 @pytest.mark.parametrize("marks", ["centres", "corners"])
-@pytest.mark.parametrize("count", [3, 5, 8])
+@pytest.mark.parametrize("count", [3, 6])
 def test_boards_that_are_not_tilted_give_a_camera_that_admits_it(marks, count):
     """Nothing tells the focal length from the distance."""
     rng = np.random.default_rng(0)

@@ -96,7 +96,9 @@ def test_level_ground_tells_no_place():
 
 
 def test_other_ground_tells_no_place():
-    found = AlignHeights()(field(ground(6)[:240, :240]), field(moved(ground(7))[:240, :240]), start())
+    found = AlignHeights()(
+        field(ground(6)[:240, :240]), field(moved(ground(7))[:240, :240]), start()
+    )
     assert isinstance(found, RefusedRegistration)
 
 

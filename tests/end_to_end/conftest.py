@@ -24,7 +24,7 @@ from skyquilt.engine.folder import CONTRACT
 from skyquilt.simulate import FlightSettings
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, Route
-from tests.once import flown_once, pictures_seen_before  # noqa: F401 - a fixture
+from tests.once import flown_once, once_for_all, pictures_seen_before  # noqa: F401 - a fixture
 from tests.photos.conftest import gps_exif, with_segment
 
 QUICK = ("--features", "300", "--surface", "ties", "--gsd", "30", "--jobs", "2")
@@ -175,11 +175,13 @@ def photos(flight: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def finished(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An undisturbed run; not to be changed."""
-    output = tmp_path_factory.mktemp("finished") / "out"
-    code, _, err = skyquilt("mosaic", flight / "photos", "-o", output, *QUICK)
-    assert code == 0, err
-    return output
+    """An undisturbed run, for all processes; not to be changed."""
+
+    def make(output: Path) -> None:
+        code, _, err = skyquilt("mosaic", flight / "photos", "-o", output, *QUICK)
+        assert code == 0, err
+
+    return once_for_all(tmp_path_factory, "small map", make)
 
 
 def named(folder: Path) -> list[Path]:

@@ -51,7 +51,7 @@ def test_keypoints_move_with_the_image(picture, angle, scale, shift, within, sha
     assert np.abs(bias).max() < 0.06  # nothing is half a pixel off
 
 
-@pytest.mark.parametrize("size", [(1200, 1600), (1201, 1602), (600, 800)])
+@pytest.mark.parametrize("size", [(1201, 1602), (600, 800)])
 def test_a_blob_is_found_where_it_is_in_full_pixels(size):
     """Shrunken or not, the centre of a Gaussian blob comes back in coordinates of the full
     image.

@@ -45,10 +45,9 @@ def apart_px(found: BandRig, a: BandCamera, b: BandCamera, camera_a):
     return np.linalg.norm(true - mine, axis=1)[inside]
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_bands_lie_on_each_other(seed):
+def test_bands_lie_on_each_other():
     """Also where the lens of the map's photos is not quite known: the band's takes that up."""
-    a, b = rig(seed, *SIZE, FOCAL)
+    a, b = rig(1, *SIZE, FOCAL)
     adjusted = replace(a.camera, focal=0.99 * a.camera.focal, cx=a.camera.cx + 2, aspect=1.004)
     told = Camera.ideal(width=SIZE[0], height=SIZE[1], focal=FOCAL)
     pairs = captures(a, b, camera_a=adjusted)

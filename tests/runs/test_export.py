@@ -194,12 +194,12 @@ def test_a_surface_model_that_is_rubbish_is_not_replaced_by_the_ground(finished,
 def test_a_map_that_was_changed_after_its_run_is_named(finished, tmp_path):
     """A JPEG tile of zeros is no error for GDAL."""
     run = shutil.copytree(finished.output, tmp_path / "run")
-    (done,) = export(run, Wanted(what=("png",)), tmp_path / "before")
+    (done,) = export(run, Wanted(what=("png",), gsd_m=0.5), tmp_path / "before")
     assert done.note == ""
     content = bytearray((run / "mosaic.tif").read_bytes())
     content[len(content) // 2 : len(content) // 2 + 400] = bytes(400)
     (run / "mosaic.tif").write_bytes(content)
-    (done,) = export(run, Wanted(what=("png",)), tmp_path / "after")
+    (done,) = export(run, Wanted(what=("png",), gsd_m=0.5), tmp_path / "after")
     assert done.note == "mosaic.tif is not as the run wrote it"
 
 

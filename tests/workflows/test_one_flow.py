@@ -33,11 +33,11 @@ QUICK = {"surface": "ties", "gsd_cm": 30.0, "jobs": 2}
     ],
     ids=str,
 )
-def test_the_scene_of_a_finished_map_is_found_not_made(flight, tmp_path, monkeypatch, asked):
+def test_the_scene_of_a_finished_map_is_found_not_made(small_flight, tmp_path, monkeypatch, asked):
     """Whatever the method: one that needs no links has none sought for it afterwards either."""
     level = {k: v for k, v in QUICK.items() if k != "surface"}
     settings = MosaicSettings(**(level if asked else QUICK), **asked)
-    given = read_input(flight / "photos", settings.input)
+    given = read_input(small_flight / "photos", settings.input)
     finished = result_of(make_map(given, tmp_path / "out", settings))
     made = []
     put = Store.put

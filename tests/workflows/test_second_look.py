@@ -78,14 +78,14 @@ def not_at_all(found, links, *given):
 
 
 @pytest.mark.parametrize("looks", [1, 2])
-def test_photos_with_few_features_are_connected(flight, tmp_path, monkeypatch, looks):
+def test_photos_with_few_features_are_connected(small_flight, tmp_path, monkeypatch, looks):
     """Thirty features of a photo are too few to link all nine; a hundred and fifty are not."""
     if looks == 1:
         monkeypatch.setattr(flow, "connect", not_at_all)
     settings = MosaicSettings(surface="ties", gsd_cm=40.0)
     methods = methods_for(settings)
     few = replace(methods, detector=methods.detector.counted(30))
-    metrics = mosaic(flight / "photos", tmp_path / "out", settings, methods=few).metrics
+    metrics = mosaic(small_flight / "photos", tmp_path / "out", settings, methods=few).metrics
     assert (metrics["blocks"] == [9]) == (looks == 2)
     assert metrics["reprojection_error_px"]["mean"] < 0.5
 
