@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from skyquilt.coregistration.orientation import orientation
 from skyquilt.geometry.camera import project, rays
