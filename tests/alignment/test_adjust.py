@@ -170,9 +170,9 @@ def gradients(problem, state):
     return photos, normal.gc + priors.camera_gradient, normal.gv
 
 
-@pytest.mark.parametrize(("points", "offset"), [(60, False), (4000, True)])
+@pytest.mark.parametrize(("points", "offset"), [(60, False), (3000, True)])
 def test_the_divided_system_is_the_dense_one(monkeypatch, points, offset):
-    """Nested dissection gives the step and the covariance of one dense matrix; 4000 points: several
+    """Nested dissection gives the step and the covariance of one dense matrix; 3000 points: several
     parts.
     """
     block = make_block(5, lines=2, per_line=18, points=points, cameras=2, overlap=0.5)

@@ -179,7 +179,8 @@ def test_what_has_no_place_for_a_keypoint_is_refused(method):
     scene = SCENE[: SMALL[0], : SMALL[1]]
     rows, columns = np.indices(SMALL)
     strips = Picture(values=scene, valid=(rows % 24 < 4) | (columns % 24 < 4))
-    for a, b in ((strips, Picture(values=scene)), (Picture(values=scene), strips)):
+    both = (strips, Picture(values=scene)), (Picture(values=scene), strips)
+    for a, b in both if method == "structure" else both[:1]:  # auto goes on to search everywhere
         assert not registration_method(method)(a, b)
 
 

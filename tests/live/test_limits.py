@@ -208,8 +208,8 @@ def test_photos_are_shown_only_with_the_content_of_the_run(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"features": 3}', "[" * 10_000, '{"features": [{}]}'])
-def test_a_damaged_run_ends_in_a_sentence(tmp_path, text):
-    run = made_run(tmp_path, tmp_path / "photos")
+def test_a_damaged_run_ends_in_a_sentence(run, tmp_path, text):
+    run = shutil.copytree(run, tmp_path / "out")
     (run / "shots.geojson").write_text(text)
     with pytest.raises(SideFileError, match="damaged"):
         open_survey(run)

@@ -15,7 +15,10 @@ from tests.papers.test_chain import ground_error
 
 def run(flight, **more):
     method = ByFlightline(
-        within=Best(count=150), across=Best(count=50), estimate=RansacSte(max_iterations=60), **more
+        within=Best(count=150),
+        across=Best(count=50),
+        estimate=RansacSte(max_iterations=200),
+        **more,
     )
     return method(flight.photos, FRAME, flight.priors, flight.features, range(len(flight.photos)))
 

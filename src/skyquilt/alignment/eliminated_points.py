@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.problem import Problem, State, linearise, linearised_points
+from skyquilt.alignment.problem import Linearised, Problem, State, linearise, linearised_points
 from skyquilt.alignment.robust import add_diagonal, observation_weights, observed_cost, point_terms
 from skyquilt.geometry.block_cholesky import Index
 
@@ -105,9 +105,13 @@ def _by_photo(row: Index, count: int, rows: Array) -> Array:
     return out
 
 
-def observation_equations(problem: Problem, state: State) -> Normal:
-    """Normal equations of the reweighted observations at a state, with the priors on points."""
-    lin = linearise(problem, state)
+def observation_equations(
+    problem: Problem, state: State, linear: Linearised | None = None
+) -> Normal:
+    """Normal equations of the reweighted observations at a state, with the priors on points.
+    `linear`: the observations there, if that is known.
+    """
+    lin = linear or linearise(problem, state)
     weight, _ = observation_weights(problem, lin.residual)
     root = np.sqrt(weight)[:, None, None]
     e, J_point = lin.residual[..., None] * root, lin.J_point * root
@@ -186,12 +190,17 @@ def points_solved(
 
 
 def points_step(
-    part: Problem, state: State, damping: float, photos: Array, cameras: Array
+    part: Problem,
+    state: State,
+    damping: float,
+    photos: Array,
+    cameras: Array,
+    linear: Linearised | None = None,
 ) -> Array:
     """The step (P, 3) of a part's points that goes with that of all photos (n, p) and of the
-    cameras (m, 11).
+    cameras (m, 11). `linear`: the observations at the state, if that is known.
     """
-    lin = linearise(part, state)
+    lin = linear or linearise(part, state)
     weight, _ = observation_weights(part, lin.residual)
     moved = lin.residual + np.einsum("nij,nj->ni", lin.J_photo, photos[part.photo])
     if lin.J_camera.shape[2]:
@@ -209,19 +218,27 @@ def polish_points(problem: Problem, state: State) -> State:
 
 
 def moved_points(
-    part: Problem, state: State, damping: float, photos: Array, cameras: Array, there: State
+    part: Problem,
+    state: State,
+    damping: float,
+    photos: Array,
+    cameras: Array,
+    there: State,
+    linear: Linearised | None = None,
 ) -> tuple[Array, float]:
     """The points (P, 3) of a part after a step, refined under the moved photos and cameras `there`,
     and the robust cost of the part there.
     """
-    X = state.X + points_step(part, state, damping, photos, cameras)
+    X = state.X + points_step(part, state, damping, photos, cameras, linear)
     settled = polish_points(part, replace(there, X=X))
     return settled.X, observed_cost(part, settled)
 
 
-def reduced_part(part: Problem, state: State, damping: float) -> Reduced:
+def reduced_part(
+    part: Problem, state: State, damping: float, linear: Linearised | None = None
+) -> Reduced:
     """The equations of a part of the observations, its points eliminated."""
-    normal = observation_equations(part, state)
+    normal = observation_equations(part, state, linear)
     L_inv = points_inverse(normal.V, damping)
     z = np.einsum("pij,pj->pi", L_inv, normal.gv)
     (s, p), (m, q) = normal.gp.shape, normal.gc.shape

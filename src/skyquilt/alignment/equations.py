@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.eliminated_points import Reduced, moved_points, reduced_part
-from skyquilt.alignment.problem import CAMERA, Problem, State
+from skyquilt.alignment.problem import CAMERA, Linearised, Problem, State, linearise
 from skyquilt.alignment.robust import add_diagonal, position_terms, prior_terms
 from skyquilt.engine.free_memory import give_back
 from skyquilt.engine.workers import HERE, Workers
@@ -132,11 +132,25 @@ class Equations:
         """
         self.problem, self.workers, self.near = problem, workers, near
         self.parts = _Parts(problem)
+        pieces = problem.pieces()
+        self._alone = pieces[0] if len(pieces) == 1 else None
+        self._linear: tuple[State, Linearised] | None = None
         self.n, self.m = len(state.C), len(state.K)
         self.p = problem.photo_unknowns
         self.q = CAMERA if problem.free.any() else 0
         border = self.q * self.m + (3 if problem.offset else 0)
         self.pattern = pattern(state.C[:, :2], self.p, border, *_together(problem))
+
+    def _linearised(self, state: State) -> Linearised | None:
+        """The observations at a state, where one part holds all: each step asks for them twice.
+        More than that are not held.
+        """
+        if self._alone is None:
+            return None
+        if self._linear is None or self._linear[0] is not state:
+            own = replace(state, X=state.X[self.problem.points_of(self._alone)])
+            self._linear = state, linearise(self.problem.part(self._alone), own)
+        return self._linear[1]
 
     def step(self, state: State, damping: float) -> tuple[Array, Array]:
         """The Gauss-Newton step of photos (n, p) and cameras (m, 11).
@@ -165,6 +179,7 @@ class Equations:
             photos=photos,
             cameras=cameras,
             there=replace(there, X=there.X[:0]),
+            linear=self._linearised(state),
         )
         X, cost = there.X, prior_terms(self.problem, there).cost
         for points, (own, observed) in self.parts.each(self.workers, state, asked):
@@ -205,7 +220,7 @@ class Equations:
         )
         g, gc = priors.photo_gradient[:, :p].copy(), np.zeros(pat.border)
         gc[: q * m] = priors.camera_gradient[:, :q].ravel()
-        asked = partial(reduced_part, damping=damping)
+        asked = partial(reduced_part, damping=damping, linear=self._linearised(state))
         for _, found in self.parts.each(self.workers, state, asked):
             U[found.seen] += found.U
             Uc += found.Uc
