@@ -44,7 +44,7 @@ def told_at(places, sigma, seed):
 
 @pytest.mark.parametrize("late", [1, -1, 3, -5])
 @pytest.mark.parametrize("sigma", [1.5, 5.0])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_late_positions_are_moved(late, sigma, seed):
     """By however many photos, and whatever is stated of their deviations."""
     true = [replace(p, sigma_C=np.full(3, sigma)) for p in told_at(LINES, 1.5, seed)]
@@ -57,7 +57,7 @@ def test_late_positions_are_moved(late, sigma, seed):
 
 
 @pytest.mark.parametrize("at", [4, 9, 12])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_from_a_missing_line_of_a_list_on_positions_are_moved(at, seed):
     """Up to one photo next to the line belongs to either side."""
     true = told_at(LINES, 1.5, seed)
@@ -91,7 +91,7 @@ def test_few_photos_move_nothing(number):
 
 
 @pytest.mark.parametrize("sigma", [0.02, 1.5, 5.0, 15.0])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_positions_that_are_right_stay(sigma, seed):
     priors = told_at(LINES, sigma, seed)
     assert unshifted(block(LINES), priors, ["A"] * len(LINES)) is priors
@@ -161,7 +161,7 @@ def test_a_flight_with_late_positions_is_placed_as_with_right_ones(seed):
 
 
 @pytest.mark.parametrize("late", [7, -7])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_all_positions_late_by_many_photos_are_moved(late, seed):
     """A clock that is off by half a minute: by more than parts of a survey are moved."""
     true = told_at(LINES, 1.5, seed)
@@ -208,7 +208,7 @@ def of_another_moment(time, late_s):
 
 @pytest.mark.parametrize("late_s", [1.0, 1.6, 4.0, -1.2])
 @pytest.mark.parametrize("sigma", [0.05, 1.0])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_positions_of_another_moment_are_moved_along_the_flight(late_s, sigma, seed):
     """The block is turned and stretched as such positions would have it: that changes nothing."""
     photos, time = timed()

@@ -82,7 +82,7 @@ def test_every_block_is_eliminated_once_and_fronts_stay_small():
     assert max(len(f.unknowns) for f in m.pattern.fronts) < 6 * 900 / 6
 
 
-@hypothesis_settings(max_examples=40, deadline=None)
+@hypothesis_settings(max_examples=25, deadline=None)
 @given(
     st.integers(1, 30),
     st.lists(st.tuples(st.integers(0, 29), st.integers(0, 29)), max_size=60),

@@ -36,7 +36,7 @@ def at(surface, margin=8.0):
     return x, y, surface.at(x, y)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(st.integers(0, 10**6))
 def test_between_nodes_heights_are_bilinear(seed):
     rng = np.random.default_rng(seed)
@@ -244,7 +244,7 @@ def test_heights_on_a_raster_are_those_at_its_places():
     assert surface.on(x, y[:0]).shape == (0, len(x))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(st.integers(0, 10**6))
 def test_at_steps_heights_are_those_of_one_side(seed):
     """Rough ground: the ends of every cell's diagonal may be a step. A place lies between the

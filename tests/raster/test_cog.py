@@ -115,7 +115,7 @@ def test_beyond_the_rim_it_fades_without_steps():
 
 
 @settings(
-    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(
     st.integers(1, 1500), st.integers(1, 700), st.sampled_from(["jpeg", "deflate"]), st.booleans()
