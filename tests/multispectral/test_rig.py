@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from skyquilt.coregistration.orientation import orientation
 from skyquilt.geometry.camera import project, rays
