@@ -214,7 +214,7 @@ def test_photos_that_sway_and_have_no_position_begin_beside_their_neighbours(see
         assert np.linalg.norm(centre - flown.truth[i].map_C) < 12
     true = np.array([180 * (i // 4 % 2) + 90.0 for i in begun[0].yaw_deg])
     apart = (np.array([*begun[0].yaw_deg.values()]) - true + 180) % 360 - 180
-    assert len(apart) == 10 and np.abs(apart).max() < 15  # 60 before
+    assert len(apart) == 12 and np.abs(apart).max() < 15  # 60 before
 
 
 def test_an_adjustment_with_far_more_observations_is_the_better_one():

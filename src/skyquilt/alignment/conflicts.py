@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from skyquilt.alignment.start import GROSS_DEG, common_error_deg
+from skyquilt.alignment.start import GROSS_DEG, heading_errors
 from skyquilt.geometry.camera import distort
-from skyquilt.geometry.frames import angle_difference_deg, angles_from_cam_R_map
+from skyquilt.geometry.frames import angle_difference_deg
 from skyquilt.model.camera import Camera
 from skyquilt.model.event import MetadataConflict
 from skyquilt.model.photo import Photo
@@ -55,22 +55,7 @@ def _yaws(
     photos: Sequence[Photo], priors: Sequence[Prior], alignment: Alignment, held: Sequence[int]
 ) -> list[MetadataConflict]:
     """Headings that are off; what those of one camera are off in common is no file's turn."""
-    off = {
-        i: angle_difference_deg(
-            priors[i].yaw_deg, angles_from_cam_R_map(alignment.poses[i].cam_R_map)[0]
-        )
-        for i in held
-        if np.isfinite(priors[i].yaw_deg)
-    }
-    cameras: dict[str, list[int]] = {}
-    for i in off:
-        cameras.setdefault(photos[i].camera_key, []).append(i)
-    common = {
-        key: common_error_deg(
-            np.array([off[i] for i in own]), [photos[i].editor is None for i in own]
-        )
-        for key, own in cameras.items()
-    }
+    off, common = heading_errors(photos, priors, {i: alignment.poses[i] for i in held})
     return [
         c
         for i in off

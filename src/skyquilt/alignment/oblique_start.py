@@ -14,13 +14,9 @@ from numpy.typing import NDArray
 from skyquilt.alignment.determined import STATED_DEG
 from skyquilt.alignment.oblique import MOST_OBLIQUE, OBLIQUE_DEG, tilt_deg, tilted, tilts_reported
 from skyquilt.alignment.similarity_graph import components
-from skyquilt.alignment.start import GROSS_DEG, Start, common_error_deg, plane_link
+from skyquilt.alignment.start import GROSS_DEG, Start, heading_errors, plane_link
 from skyquilt.alignment.triangulate import intersect
-from skyquilt.geometry.frames import (
-    angle_difference_deg,
-    angles_from_cam_R_map,
-    cam_R_map_from_angles,
-)
+from skyquilt.geometry.frames import angles_from_cam_R_map, cam_R_map_from_angles
 from skyquilt.matching.lens_kind import as_pinhole
 from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import Photo
@@ -76,20 +72,13 @@ def beginnings(found: Alignment, photos: Sequence[Photo], priors: Sequence[Prior
     """Headings of compasses that are grossly off, and centres of photos that report their angles
     but no position, by an adjustment: it may be off, but hardly so from one photo to the next.
     """
-    held = [i for i in found.held if told(priors[i])]
-    off = {
-        i: angle_difference_deg(
-            priors[i].yaw_deg, angles_from_cam_R_map(found.poses[i].cam_R_map)[0]
-        )
-        for i in held
+    off, common = heading_errors(photos, priors, {i: found.poses[i] for i in found.held})
+    yaw_deg = {
+        i: priors[i].yaw_deg - common[photos[i].camera_key]
+        for i in off
+        if abs(common[photos[i].camera_key]) > GROSS_DEG
     }
-    yaw_deg: dict[int, float] = {}
-    for key in dict.fromkeys(photos[i].camera_key for i in held):
-        own = [i for i in held if photos[i].camera_key == key]
-        whole = [photos[i].editor is None for i in own]
-        common = common_error_deg(np.array([off[i] for i in own]), whole)
-        if abs(common) > GROSS_DEG:
-            yaw_deg |= {i: priors[i].yaw_deg - common for i in own}
+    held = [i for i in found.held if told(priors[i])]
     centres: dict[int, Array] = {}
     C = np.array([found.poses[i].map_C for i in held]).reshape(-1, 3)
     apart = np.array([priors[i].map_C for i in held]).reshape(-1, 3) - C

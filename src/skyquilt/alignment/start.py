@@ -21,11 +21,11 @@ from skyquilt.alignment.similarity_graph import (
     solve_block,
     tie_to_positions,
 )
-from skyquilt.geometry.frames import angle_difference_deg
+from skyquilt.geometry.frames import angle_difference_deg, angles_from_cam_R_map
 from skyquilt.matching.lens_kind import as_pinhole
 from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import Photo
-from skyquilt.model.poses import MapFrame, Prior
+from skyquilt.model.poses import MapFrame, Pose, Prior
 
 NOMINAL_HEIGHT_M = 50.0
 """Height above ground in m assumed if no data determine the scale; the result is then marked as not
@@ -257,18 +257,40 @@ def steered(
             headed = [m for m in own if np.isfinite(priors[m].yaw_deg)]
             off = [angle_difference_deg(priors[m].yaw_deg, yaw_deg[m]) for m in headed]
             common = common_error_deg(np.array(off), [photos[m].editor is None for m in headed])
-            false = abs(common) > GROSS_DEG
+            gross = abs(common) > GROSS_DEG
             for m in headed:
                 told_deg = priors[m].sigma_yaw_deg
                 share = max(0.0, 1 - (loose / told_deg) ** 2)
                 looser = told_deg * np.sqrt(1 + share * (len(headed) - 1))
-                sigma_deg = max(told_deg, min(looser, LOOSEST_DEG))
+                sigma_deg = UNKNOWN_YAW_DEG if gross else min(looser, LOOSEST_DEG)
                 out[m] = replace(
                     priors[m],
-                    yaw_deg=priors[m].yaw_deg - (common if false else 0.0),
-                    sigma_yaw_deg=max(sigma_deg, UNKNOWN_YAW_DEG) if false else float(sigma_deg),
+                    yaw_deg=priors[m].yaw_deg - (common if gross else 0.0),
+                    sigma_yaw_deg=float(max(told_deg, sigma_deg)),
                 )
     return out
+
+
+def heading_errors(
+    photos: Sequence[Photo], priors: Sequence[Prior], found: Mapping[int, Pose]
+) -> tuple[dict[int, float], dict[str, float]]:
+    """Reported minus found heading in degrees of each of some photos that reports one, and what
+    those of each camera have in common.
+    """
+    off = {
+        i: angle_difference_deg(priors[i].yaw_deg, angles_from_cam_R_map(pose.cam_R_map)[0])
+        for i, pose in found.items()
+        if np.isfinite(priors[i].yaw_deg)
+    }
+    cameras: dict[str, list[int]] = {}
+    for i in off:
+        cameras.setdefault(photos[i].camera_key, []).append(i)
+    return off, {
+        key: common_error_deg(
+            np.array([off[i] for i in own]), [photos[i].editor is None for i in own]
+        )
+        for key, own in cameras.items()
+    }
 
 
 def common_error_deg(off_deg: NDArray[np.float64], whole: Sequence[bool]) -> float:
