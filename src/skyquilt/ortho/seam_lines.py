@@ -84,7 +84,7 @@ class SeamLines:
     """The same for a height of one metre or more above the surroundings, in grey values."""
     least: int = 24
     """Undisputed patches of fewer cells are contested too."""
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 5
 
     def __call__(
         self,
@@ -168,7 +168,10 @@ class SeamLines:
         views, score, nodes = seen
         order, best = _three(score)
         index = np.array([*(v.photo for v in views), -1], np.int32)
-        ranked = index[order]
+        # what is smeared, marked or white floods no place that another one shows well; what is
+        # hidden may: objects are cut less
+        worse = np.abs(best[1:] - np.where(order[0] >= 0, best[0], 0) - SMEARED) < SMEARED / 2
+        ranked = index[np.concatenate([order[:1], np.where(worse, -1, order[1:])])]
         centre = np.array([(*v.pose.map_C[:2],) for v in views] + [(0.0, 0.0)])
         apart = np.hypot(*(centre[order[0]] - centre[order[1]]).transpose(2, 0, 1))
         above = np.array([n.height for n in nodes] + [1.0])[order[0]]
