@@ -25,7 +25,7 @@ LINES = ((8, 350), (8, 58), (8, 86))
 def plain(tmp_path_factory):
     """14 photos of 480 x 360 px in lines."""
     control = Control(points=0, checks=0)
-    return made(tmp_path_factory, "marks", seed=2, route=Route(photos=14), control=control)
+    return made(tmp_path_factory, "marks", seed=3, route=Route(photos=14), control=control)
 
 
 @pytest.fixture(scope="module")
@@ -67,8 +67,16 @@ def rms(live, flight):
     return np.sqrt((offsets(live, flight)[:, :2] ** 2).mean(0)).max()
 
 
+RIM = 70
+"""Pixels of a photo at its rim: where it gives way to another one is told from node to node of the
+drawn map, of which each pixel is four of a photo.
+"""
+
+
 def white(live):
-    """Share of the ground that three photos and more show that is white as letters are."""
+    """Share of the ground that three photos and more show, not at their rims, that is white as
+    letters are.
+    """
     tiles = [
         (live.tiles.get(a), shown_by(live, a) >= 3) for a in live.tiles.addresses("visible", 0)
     ]
@@ -76,7 +84,7 @@ def white(live):
 
 
 def shown_by(live, address):
-    """How many photos show each pixel of a tile, on level ground."""
+    """How many photos show each pixel of a tile, on level ground, not at their rims."""
     grid = address.grid(live.canvas.gsd)
     x, y = np.meshgrid(grid.x(np.arange(grid.width)), grid.y(np.arange(grid.height)))
     ground = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, live.canvas.ground)])
@@ -85,12 +93,13 @@ def shown_by(live, address):
         local = member.pose.to_camera(ground)
         px = project(live.members.camera(member), local)
         wide, high = member.photo.width, member.photo.height
-        count += ((px > 0) & (px < (wide - 1, high - 1))).all(1) & (local[:, 2] > 0)
+        inside = ((px > RIM) & (px < (wide - RIM, high - RIM))).all(1)
+        count += inside & (local[:, 2] > 0)
     return count.reshape(x.shape)
 
 
 def test_a_text_in_every_picture_moves_nothing(plain, unmarked, marked):
-    """Without marks it moves photos by 16 m. Positions scatter by 2 m."""
+    """Without marks it moved photos of one flight by 16 m. Positions scatter by 2 m."""
     assert [m.state for m in marked.members.by_id.values()] == ["refined"] * 14
     assert rms(marked, plain) < 1.2 * rms(unmarked, plain) < 1.5
     marks = unmarked.live_links.marks.known.masks, marked.live_links.marks.known.masks
@@ -110,7 +119,7 @@ def test_a_text_is_drawn_only_where_nothing_else_is(
     finally:
         everywhere.close()
     assert text > without + 0.003
-    assert mended - without < 0.85 * (text - without)  # the rest lies at the rim
+    assert mended - without < 0.25 * (text - without)  # 0.14; the rest lies between nodes
     off = []
     for address in marked.tiles.addresses("visible", 0):
         stored, compose = (
