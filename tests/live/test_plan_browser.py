@@ -103,6 +103,21 @@ def test_an_area_is_drawn_by_keyboard(page, tmp_path):  # noqa: F811
         assert not page.errors
 
 
+def settled(page):  # noqa: F811
+    """The pixels of the page when they have not changed for two seconds: tiles come when the
+    machine has time for them.
+    """
+    page.wait_for_timeout(3000)
+    before = page_pixels(page)
+    for _ in range(15):
+        page.wait_for_timeout(2000)
+        now = page_pixels(page)
+        if np.array_equal(now, before):
+            break
+        before = now
+    return before
+
+
 def test_photos_placed_by_their_metadata_are_pale_until_they_are_refined(page, flight, tmp_path):  # noqa: F811
     """A dashed outline, and a fifth of white over what is not sure yet, however many photos show
     it; gone when they are refined.
@@ -121,15 +136,13 @@ def test_photos_placed_by_their_metadata_are_pale_until_they_are_refined(page, f
         assert all(styles)
         page.click("#tracks")  # their lines would be counted too
         page.click("#fit")
-        page.wait_for_timeout(3000)
+        pale = settled(page)
         shot(page, "provisional")
-        pale = page_pixels(page)
         assert problems(page) == []
         live._refined = refined
         holds(page, f"{count} == 0", 60)
-        page.wait_for_timeout(4000)
+        sure = settled(page)
         shot(page, "no-longer-provisional")
-        sure = page_pixels(page)
         drawn = (np.abs(sure - (217, 217, 217)).max(-1) > 30) & (
             np.abs(pale - (217, 217, 217)).max(-1) > 12
         )
