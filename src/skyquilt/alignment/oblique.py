@@ -62,6 +62,16 @@ def tilted(prior: Prior) -> bool:
     return prior.sigma_tilt_deg <= STATED_DEG and tilt_deg(R) > OBLIQUE_DEG
 
 
+def told(prior: Prior) -> bool:
+    """Whether metadata tell a photo's whole pose."""
+    return bool(np.isfinite(prior.map_C).all()) and tells_angles(prior)
+
+
+def tells_angles(prior: Prior) -> bool:
+    """Whether metadata tell a photo's attitude."""
+    return bool(np.isfinite(prior.yaw_deg)) and prior.sigma_tilt_deg <= STATED_DEG
+
+
 def looked_at(priors: Sequence[Prior], ground_m: float) -> Array | None:
     """Places (n, 4) by which photos that may show the same are near to one another, where some
     report that they are oblique; None where none does. In m: where each looks at level ground of
@@ -79,7 +89,7 @@ def looked_at(priors: Sequence[Prior], ground_m: float) -> Array | None:
     places = np.zeros((len(priors), 4))
     places[:, :2] = C[:, :2]
     for i, prior in enumerate(priors):
-        if np.isfinite(prior.yaw_deg) and prior.sigma_tilt_deg <= STATED_DEG:
+        if tells_angles(prior):
             R = cam_R_map_from_angles(prior.yaw_deg, prior.pitch_deg, prior.roll_deg)
             away = R[2, :2] / max(-R[2, 2], LEAST_FALL)
             places[i, :2] += away * (above[i] if above[i] > 0 else usual)
@@ -157,14 +167,11 @@ def _contradicts(pose: Pose, prior: Prior) -> bool:
     """Whether a photo looks and lies far from where it reports: begun as a vertical one, it may
     have fallen into another minimum than that of the photos around.
     """
-    if (
-        not prior.sigma_tilt_deg <= STATED_DEG
-        or not np.isfinite([*prior.map_C, prior.yaw_deg]).all()
-    ):
+    if not told(prior):
         return False
-    told = cam_R_map_from_angles(prior.yaw_deg, prior.pitch_deg, prior.roll_deg)
+    reported = cam_R_map_from_angles(prior.yaw_deg, prior.pitch_deg, prior.roll_deg)
     away = np.linalg.norm((pose.map_C - prior.map_C) / prior.sigma_C)
-    turned = np.degrees(np.arccos(np.clip(pose.cam_R_map[2] @ told[2], -1, 1)))
+    turned = np.degrees(np.arccos(np.clip(pose.cam_R_map[2] @ reported[2], -1, 1)))
     return bool(away > FAR_OFF and turned > TURNED_DEG)
 
 

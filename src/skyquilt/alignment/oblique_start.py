@@ -12,7 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.determined import STATED_DEG
-from skyquilt.alignment.oblique import MOST_OBLIQUE, OBLIQUE_DEG, tilt_deg, tilted, tilts_reported
+from skyquilt.alignment.oblique import (
+    MOST_OBLIQUE,
+    OBLIQUE_DEG,
+    tells_angles,
+    tilt_deg,
+    tilted,
+    tilts_reported,
+    told,
+)
 from skyquilt.alignment.similarity_graph import components
 from skyquilt.alignment.start import GROSS_DEG, Start, heading_errors, plane_link
 from skyquilt.alignment.triangulate import intersect
@@ -102,16 +110,6 @@ def aslant(priors: Sequence[Prior]) -> bool:
     known = [cam_R_map_from_angles(0.0, p.pitch_deg, p.roll_deg) for p in priors if told(p)]
     half = len(known) > len(priors) / 2
     return half and not slanting(priors) and np.median([*map(tilt_deg, known)]) > ASLANT_DEG
-
-
-def told(prior: Prior) -> bool:
-    """Whether metadata tell a photo's whole pose."""
-    return bool(np.isfinite(prior.map_C).all()) and tells_angles(prior)
-
-
-def tells_angles(prior: Prior) -> bool:
-    """Whether metadata tell a photo's attitude."""
-    return bool(np.isfinite(prior.yaw_deg)) and prior.sigma_tilt_deg <= STATED_DEG
 
 
 def untold(priors: Sequence[Prior]) -> frozenset[int]:
