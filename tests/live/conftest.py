@@ -135,7 +135,9 @@ class Served:
         def still() -> bool:
             live = self.live
             redraw, schedule = live.redraw, live.schedule
-            if live.queues.untried or redraw.urgent or redraw.pending:
+            if live.queues.received or live.queues.untried:
+                return False
+            if redraw.urgent or redraw.pending:
                 return False
             if redraw.dirty or redraw.later or live.background.busy or schedule.under_way:
                 return False

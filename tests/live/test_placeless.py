@@ -96,8 +96,8 @@ def test_without_positions_the_map_begins_with_four_and_tells_no_place(flight, t
     with served(tmp_path / "out", QUICK) as site:
         for path in photos[: FEWEST - 1]:
             site.send(path)
-        site.until(lambda: len(site.states()) == FEWEST - 1 and not site.live.queues.untried)
-        assert set(site.states().values()) == {"waiting"}
+        waiting, queues = ["waiting"] * (FEWEST - 1), site.live.queues
+        site.until(lambda: list(site.states().values()) == waiting and not queues.untried)
         assert not site.web.get("/info").json()["layers"]
         for path in photos[FEWEST - 1 :]:
             site.send(path)
