@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.geometry.frames import angle_difference_deg, angles_from_cam_R_map
+from skyquilt.alignment.start import common_angle_deg
+from skyquilt.geometry.frames import angles_from_cam_R_map
 from skyquilt.model.poses import Alignment, Prior
 
 LOOSE_SCALE, LOOSE_DEG = 0.05, 5.0
@@ -155,12 +156,9 @@ def _heading(found: Alignment, priors: Sequence[Prior], held: Sequence[int]) -> 
         return None
     grid = [angles_from_cam_R_map(found.poses[i].cam_R_map)[0] for i in told]
     off = np.array([priors[i].yaw_deg for i in told]) - grid
-    apart = np.abs(angle_difference_deg(off[:, None], off))
-    usual = off[np.argmin(apart.sum(1))]  # files that were turned have another one
-    alike = angle_difference_deg(off, usual)
-    if 2 * (np.abs(alike) < ALIKE_DEG).sum() <= len(alike):
+    by = common_angle_deg(off, ALIKE_DEG)  # files that were turned have another one
+    if by is None:
         return None
-    by = angle_difference_deg(usual, -float(np.median(alike[np.abs(alike) < ALIKE_DEG])))
     to = weighed(by, loose, float(np.median([priors[i].sigma_yaw_deg for i in told])))
     if to is None:
         return None  # told for each photo (`alignment.conflicts`)

@@ -304,13 +304,22 @@ def common_error_deg(off_deg: NDArray[np.float64], whole: Sequence[bool]) -> flo
     off = own if len(own) >= FEWEST_HEADINGS else off_deg
     if len(off) < FEWEST_HEADINGS:
         return 0.0
-    near = np.abs(angle_difference_deg(off[:, None], off)) < ALIKE_DEG
-    best = int(np.argmax(near.sum(1)))
-    if 2 * near[best].sum() <= len(off):
+    angle = common_angle_deg(off, ALIKE_DEG)
+    if angle is None:
         return 0.0
-    about = angle_difference_deg(off[near[best]], off[best])
-    angle = angle_difference_deg(float(off[best]), -float(np.median(about)))
     return 0.0 if off is off_deg and not all(whole) and abs(angle) > 180 - ALIKE_DEG else angle
+
+
+def common_angle_deg(off_deg: NDArray[np.float64], alike_deg: float) -> float | None:
+    """The angle in degrees that more than half of some (n,) share within `alike_deg`, as their
+    median; None where they do not agree. Not empty.
+    """
+    near = np.abs(angle_difference_deg(off_deg[:, None], off_deg)) < alike_deg
+    best = int(np.argmax(near.sum(1)))
+    if 2 * near[best].sum() <= len(off_deg):
+        return None
+    about = angle_difference_deg(off_deg[near[best]], off_deg[best])
+    return float(angle_difference_deg(float(off_deg[best]), -float(np.median(about))))
 
 
 def _direction_deg(C: NDArray[np.float64], sigma_m: NDArray[np.float64]) -> float:
