@@ -130,14 +130,44 @@ def test_a_frame_is_decoded_from_its_clip_once(film, tmp_path, monkeypatch):
     assert (pixels_of(photo, store) == first).all()
 
 
-def test_telemetry_of_another_clip_is_not_used(film, tmp_path):
-    path = tmp_path / "B.MP4"
+def told(film, folder, first_s, rows):
+    """A link to the clip of 24 s, with a position of each second from `first_s` on."""
+    path = folder / "B.MP4"
     path.symlink_to(film)
     row = (
-        "{n}\n00:00:{a:02d},000 --> 00:00:{b:02d},000\n[latitude: 46.{n:06d}] [longitude: 14.3]\n\n"
+        "{n}\n00:00:{n:02d},000 --> 00:00:{n:02d},999\n[latitude: 46.{n:06d}] [longitude: 14.3]\n\n"
     )
-    text = "".join(row.format(n=n + 1, a=n, b=n + 1) for n in range(9))  # the clip has 24 s
+    text = "".join(row.format(n=n) for n in range(first_s, first_s + rows))
     path.with_suffix(".SRT").write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("first_s", "rows", "source", "offset_s"),
+    [
+        (9, 24, "span", 9.0),  # all of it is late
+        (0, 24, "clock", 0.0),
+        (7, 17, "clock", 0.0),  # the receiver began late
+        (0, 34, "clock", 0.0),  # it was written on after the clip ended
+        (3, 31, "clock", 0.0),  # both
+    ],
+)
+def test_telemetry_that_is_late_as_a_whole_begins_with_the_clip(
+    film, tmp_path, first_s, rows, source, offset_s
+):
+    """Where the flight does not show when its positions were taken."""
+    path, store = (
+        told(film, tmp_path, first_s, rows),
+        Store(folder=tmp_path / "store", registry=REGISTRY),
+    )
+    found = result_of(with_frames(read_input(path, InputSettings()), InputSettings(), store))
+    (clip,) = found.clips
+    assert (clip.offset_source, clip.offset_s) == (source, offset_s)
+    assert any("is taken to begin with the clip" in n for n in found.survey.notes) == (offset_s > 0)
+
+
+def test_telemetry_of_another_clip_is_not_used(film, tmp_path):
+    path = told(film, tmp_path, 0, 9)
     settings, store = InputSettings(), Store(folder=tmp_path / "store", registry=REGISTRY)
     found = result_of(with_frames(read_input(path, settings), settings, store))
     assert all(p.position is None for p in found.survey.photos)

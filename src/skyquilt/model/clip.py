@@ -162,7 +162,9 @@ class ChosenFrames:
     offset_sigma_s: float | None = None
     """Standard deviation of the offset in s; None where it was not found from the flight."""
     offset_source: str = "none"
-    """`turns`, `option`, `clock` or `none`."""
+    """`turns` (found from the flight), `option`, `span` (positions last as long as the clip and are
+    taken to begin with it), `clock` or `none`.
+    """
     placed: int = 0
     """Chosen frames that got a position."""
 

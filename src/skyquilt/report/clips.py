@@ -18,6 +18,7 @@ WHY = {
 OFFSETS = {
     "turns": "found from the flight",
     "option": "given",
+    "span": "not found; positions begin with the clip",
     "clock": "not found; clocks taken as they are",
     "none": "no positions",
 }
