@@ -201,11 +201,11 @@ def timed(
         beyond = float(track.height_time_s[-1]) - lasts
         row = told / max(len(track.height_time_s) - 1, 1)
         if min(late, beyond) > _SPAN_S and abs(late - beyond) < _SPAN_S + row:
-            said = (
+            begun = (
                 f"{track.file} lasts as long as the clip, but begins at {late:.1f} s. It is taken"
                 " to begin with the clip. --clock-offset 0 takes its times as they are."
             )
-            return replace(chosen, offset_s=late, offset_source="span"), True, [said]
+            return replace(chosen, offset_s=late, offset_source="span"), True, [begun]
     inside = track.height_time_s[0] - 1 <= zero <= track.height_time_s[-1] + 1
     if not track.on_clip and (clip.start is None or not inside):
         return (
