@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.adjust import adjust
 from skyquilt.alignment.motion import velocities
+from skyquilt.alignment.oblique import told_tilt
 from skyquilt.alignment.problem import Problem, State, residuals_px
 from skyquilt.alignment.setup import HALF_TURN, Setup, pose_records, set_up
+from skyquilt.alignment.similarity_graph import fit_similarity
 from skyquilt.alignment.stages import prune
-from skyquilt.alignment.start import Start, plane_link
+from skyquilt.alignment.start import Start
 from skyquilt.alignment.tracks import Tracks, build_tracks, thin
 from skyquilt.alignment.triangulate import triangulated
 from skyquilt.geometry.camera import rays
@@ -32,8 +34,18 @@ STAGES = ((2.0, 20.0, 40.0, 3e-2), (0.8, 6.0, 12.0, 1e-2), (0.0, 2.5, 5.0, 1e-2)
 """Rounds of an adjustment: the median residual in px of the new photo from which the round is
 needed, width of the loss in px, residual in px above which observations are removed, and tolerance.
 """
+STEEPNESS = 0.1
+"""Rays flatter than this (the sine of their angle below the horizon) are taken for as steep."""
+UNEVEN = 0.02
+"""Deviation of what links show from level ground, as a share of the flying height."""
+MOST_WEIGHT = 300.0
+"""Matches of a link beyond so many do not make it count more."""
 TURNED = "/turned"
 """Suffix of the names of calibrations for files that were saved upside down."""
+
+
+Array = NDArray[np.float64]
+Similarity = tuple[complex, complex]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -93,7 +105,9 @@ class NotAdjusted:
 
 @dataclass(frozen=True, kw_only=True)
 class LocalAdjustment:
-    """A similarity from the links, followed by a bundle adjustment of the window."""
+    """A similarity from the links, of the photo levelled by the tilt that it reports, followed by a
+    bundle adjustment of the window.
+    """
 
     per_photo: int = 120
     """Observations per photo in the adjustment."""
@@ -103,14 +117,14 @@ class LocalAdjustment:
     """Links that put a photo further apart than this share of the flying height contradict each
     other.
     """
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
 
     def __call__(self, window: Window) -> AdjustedWindow | NotAdjusted:
         """Places the new photo and refines the free ones."""
         plane = {i: similarity_of(window, i) for i in window.poses}
         dropped: tuple[tuple[int, int], ...] = ()
         if window.new not in window.poses:
-            guess = _guess(window, plane, self.disagree)
+            guess = _guess(window, self.disagree)
             if guess is None:
                 return NotAdjusted(reason="its links contradict each other")
             plane[window.new], agreeing = guess
@@ -169,39 +183,57 @@ def similarity_of(window: Window, i: int) -> tuple[complex, complex]:
     """a and t of the similarity x + iy = a p + t that approximates a placed photo near its centre
     (see `similarity_graph`).
     """
-    pose, photo = window.poses[i], window.photos[i]
+    photo = window.photos[i]
     centre = np.array([[(photo.width - 1) / 2, (photo.height - 1) / 2]])
     step = np.array([[photo.focal.px / 4, 0.0]])
-    camera = window.cameras.get(window.camera_of.get(i, "")) or photo.lens
-    direction = (
-        rays(camera, np.concatenate([centre, centre + step, centre - step])) @ pose.cam_R_map
-    )
-    down = np.minimum(direction[:, 2], -0.1)
-    reach = (window.ground - pose.map_C[2]) / down
-    xy = pose.map_C[:2] + direction[:, :2] * reach[:, None]
-    z = xy[:, 0] + 1j * xy[:, 1]
+    z = _on_ground(window, i, np.concatenate([centre, centre + step, centre - step]))
     a = (z[1] - z[2]) / 0.5
     # for an ideal lens the centre has photo coordinates 0
     return complex(a), complex(z[0])
 
 
-def _guess(
-    window: Window, plane: Mapping[int, tuple[complex, complex]], disagree: float
-) -> tuple[tuple[complex, complex], set[tuple[int, int]]] | None:
-    """The new photo's similarity that most of its links agree with, and those links."""
+def _on_ground(window: Window, i: int, px: Array) -> NDArray[np.complex128]:
+    """Where pixels (n, 2) of a placed photo show level ground, as x + iy in m."""
+    pose = window.poses[i]
+    camera = window.cameras.get(window.camera_of.get(i, "")) or window.photos[i].lens
+    direction = rays(camera, px) @ pose.cam_R_map
+    down = np.minimum(direction[:, 2], -STEEPNESS)
+    reach = (window.ground - pose.map_C[2]) / down
+    xy = pose.map_C[:2] + direction[:, :2] * reach[:, None]
+    return np.asarray(xy[:, 0] + 1j * xy[:, 1])
+
+
+def _levelled(window: Window, px: Array) -> NDArray[np.complex128]:
+    """Pixels (n, 2) of the new photo as photo coordinates of one that looks straight down, by the
+    tilt that it reports.
+    """
+    photo = window.photos[window.new]
+    camera = window.cameras.get(photo.camera_key) or photo.lens
+    direction = rays(camera, px) @ told_tilt(window.priors[window.new], 0.0)
+    xy = direction[:, :2] / np.maximum(-direction[:, 2:], STEEPNESS)
+    return np.asarray(xy[:, 0] + 1j * xy[:, 1])
+
+
+def _guess(window: Window, disagree: float) -> tuple[Similarity, set[tuple[int, int]]] | None:
+    """The similarity of the levelled new photo that most of its links agree with, and those links.
+    Each tells one by where the placed photo shows what both see.
+    """
+    photo = window.photos[window.new]
+    middle = np.array([[(photo.width - 1) / 2, (photo.height - 1) / 2]])
+    centre = complex(_levelled(window, middle)[0])
     found: list[tuple[complex, complex, float, tuple[int, int]]] = []
     for link in window.links:
-        other = link.b if link.a == window.new else link.a if link.b == window.new else None
-        if other is None or other not in plane:
+        other = link.other(window.new)
+        if window.new not in (link.a, link.b) or other not in window.poses:
             continue
-        k = plane_link(link, window.photos, window.features)
-        a, t = plane[other]
-        if link.b == window.new:
-            own = a / k.b_S_a
-            found.append((own, a * k.p_a + t - own * k.p_b, k.weight, (link.a, link.b)))
-        else:
-            own = a * k.b_S_a
-            found.append((own, a * k.p_b + t - own * k.p_a, k.weight, (link.a, link.b)))
+        own, theirs = (
+            (link.index_b, link.index_a) if link.b == window.new else (link.index_a, link.index_b)
+        )
+        p = _levelled(window, window.features[window.new].px[own])
+        ground = _on_ground(window, other, window.features[other].px[theirs])
+        high = abs(float(window.poses[other].map_C[2]) - window.ground)
+        a, t, _ = fit_similarity(p, ground, np.full(len(p), UNEVEN * max(high, 1.0)))
+        found.append((a, a * centre + t, min(float(len(p)), MOST_WEIGHT), (link.a, link.b)))
     if not found:
         return None
 
@@ -220,8 +252,9 @@ def _guess(
             np.average(np.log([found[n][0] / found[group[0]][0] for n in group]), weights=weight)
         )
     )
-    t = complex(np.average([found[n][1] for n in group], weights=weight))
-    return (a * found[group[0]][0], t), {found[n][3] for n in group}
+    a *= found[group[0]][0]
+    t = complex(np.average([found[n][1] for n in group], weights=weight)) - a * centre
+    return (a, t), {found[n][3] for n in group}
 
 
 def held_setup(
@@ -261,6 +294,9 @@ def held_setup(
             pose = window.poses[i]
             R[row] = HALF_TURN @ pose.cam_R_map if turned[i] else pose.cam_R_map
             C[row] = pose.map_C
+        elif not turned[i]:
+            yaw_deg = -float(np.degrees(np.angle(plane[i][0])))
+            R[row] = told_tilt(window.priors[i], yaw_deg)
         if i in window.held:
             R0[row], C0[row], sigma_R[row], sigma_C[row] = R[row], C[row], HELD_RAD, HELD_M
     K0, free = base.K0.copy(), base.free.copy()

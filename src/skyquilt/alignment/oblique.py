@@ -72,6 +72,15 @@ def tells_angles(prior: Prior) -> bool:
     return bool(np.isfinite(prior.yaw_deg)) and prior.sigma_tilt_deg <= STATED_DEG
 
 
+def told_tilt(prior: Prior, yaw_deg: float) -> Array:
+    """The attitude (map to camera) of a photo with this heading and the tilt that its metadata
+    report; straight down where they report none.
+    """
+    if prior.sigma_tilt_deg > STATED_DEG:
+        return cam_R_map_from_angles(yaw_deg)
+    return cam_R_map_from_angles(yaw_deg, prior.pitch_deg, prior.roll_deg)
+
+
 def looked_at(priors: Sequence[Prior], ground_m: float) -> Array | None:
     """Places (n, 4) by which photos that may show the same are near to one another, where some
     report that they are oblique; None where none does. In m: where each looks at level ground of
