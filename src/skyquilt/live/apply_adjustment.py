@@ -10,11 +10,13 @@ from skyquilt.live.events import Update
 from skyquilt.live.ledger import hit
 from skyquilt.live.members import Member, about_record
 from skyquilt.live.refinement import Refinement
-from skyquilt.live.settings import CLOSING
+from skyquilt.live.settings import CLOSING, YOUNG
 from skyquilt.model.poses import Pose
 
 OUTDATED = 0.5
 """Cells of heights by which a result lies elsewhere than its photos do now."""
+OUTGROWN = 2.0
+"""A result tells less than its photos do now where their block has so many times as many."""
 
 
 class ApplyAdjustment:
@@ -62,11 +64,15 @@ class ApplyAdjustment:
 
     def _outdated(self, done: BlockAdjustment) -> bool:
         """Whether all its photos have been adjusted since the job began, together with others that
-        it did not know, and lie elsewhere now.
+        it did not know, and lie elsewhere now, or rest on far more than the job had. In a block
+        that is adjusted with every photo, those that joined would move all of them again at once.
         """
         now = [self.members.by_id[i].pose for i in done.poses]
         if not all(_differs(p, done.before.get(i)) for i, p in zip(done.poses, now, strict=True)):
             return False
+        had, has = len(done.ids), len(self.members.block(next(iter(done.poses))))
+        if has > had and (has <= YOUNG or has > OUTGROWN * had):
+            return True
         off = [
             np.linalg.norm(p.map_C - new.map_C)
             for new, p in zip(done.poses.values(), now, strict=True)
