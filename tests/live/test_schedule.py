@@ -7,22 +7,25 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from skyquilt.live.adjustment_schedule import Blocks, Schedule
+from skyquilt.live.adjustment_schedule import QUIET_S, Blocks, Schedule
 from skyquilt.live.apply_adjustment import ApplyAdjustment
 from skyquilt.live.background_adjustment import BlockAdjustment
-from skyquilt.live.settings import CLOSING, GROWTH, PART, LiveSettings
+from skyquilt.live.settings import CLOSING, GROWTH, PART, SWEEPING, YOUNG, LiveSettings
 from skyquilt.model.poses import Pose
 from skyquilt.settings import MosaicSettings
 from skyquilt.workflows.methods import methods_for
 
 
-def blocks_of(*sizes, closed=(), since=1, loop=None):
-    """Blocks of so many photos, each a chain, and what `due` would work on: (photos, held)."""
+def blocks_of(*sizes, closed=(), since=1, loop=None, waiting=0):
+    """Blocks of so many photos, each a chain, and what `due` would work on: (photos, held). Those
+    of the last `waiting` blocks are not on the map.
+    """
     sets, by_id, first = {}, {}, 1
     for size in sizes:
         sets[first] = set(range(first, first + size))
+        pose = None if len(sets) > len(sizes) - waiting else object()
         for i in sets[first]:
-            by_id[i] = SimpleNamespace(links={i - 1, i + 1} & sets[first], pose=object())
+            by_id[i] = SimpleNamespace(links={i - 1, i + 1} & sets[first], pose=pose)
         first += size
     block_of = {i: name for name, ids in sets.items() for i in ids}
     members = SimpleNamespace(
@@ -49,6 +52,40 @@ def test_every_block_is_bundled_as_it_grows_not_only_the_largest():
     assert 7 / 6 < GROWTH
 
 
+def test_when_no_photos_arrive_all_blocks_are_adjusted_as_they_are_and_swept_once():
+    blocks = blocks_of(13, 12, SWEEPING + 1, 2, closed=(10, 12, SWEEPING + 1))
+    asked = []
+    blocks._job = lambda ids, held, ground, sweep: asked.append((min(ids), sweep)) or (ids, held)
+    assert blocks.due(0.0, idle=False)[0] == list(range(1, 14))  # it has grown
+    assert blocks.due(0.0, idle=True) is None  # photos have just arrived
+    blocks.last_arrival -= QUIET_S + 1
+    while blocks.due(0.0, idle=True) is not None:
+        pass
+    assert asked == [(1, False), (1, True), (14, True)]
+    blocks.schedule.swept_at.clear()
+    blocks.schedule.given_up({k: len(v) for k, v in blocks.members.blocks.items()})
+    assert blocks.due(0.0, idle=True) is None
+
+
+def test_what_was_swept_is_known_after_a_restart_but_not_what_was_under_way():
+    kept = {}
+    ledger = SimpleNamespace(meta=kept.get, put_meta=kept.__setitem__)
+    schedule = Schedule.read(ledger)
+    schedule.begun(1, 13, sweep=True)
+    schedule.ended()
+    schedule.begun(14, 12, sweep=True)
+    schedule.write(ledger)
+    assert Schedule.read(ledger).swept_at == {1: 13}
+
+
+def test_blocks_of_which_no_photo_is_on_the_map_are_not_adjusted():
+    blocks = blocks_of(4, 9, closed=(3,), waiting=1)
+    assert blocks.due(0.0, idle=False)[0] == list(range(1, 5))
+    blocks.last_arrival -= QUIET_S + 1
+    assert blocks.due(0.0, idle=True)[0] == list(range(1, 5))
+    assert blocks.due(0.0, idle=True) is None
+
+
 @pytest.mark.parametrize("size", [CLOSING, CLOSING + 1])
 def test_of_a_large_block_a_part_is_adjusted_around_its_newest_photo(size):
     blocks = blocks_of(size, closed=(100,), since=PART)
@@ -66,11 +103,19 @@ def test_a_loop_comes_first():
 
 
 @pytest.mark.parametrize(
-    ("since", "cell", "dropped"),
-    [("none", 2.0, False), ("one", 2.0, False), ("all", 2.0, True), ("all", 20.0, False)],
+    ("since", "cell", "block", "dropped"),
+    [
+        ("none", 2.0, 3, False),
+        ("one", 2.0, 3, False),
+        ("all", 2.0, 3, True),
+        ("all", 20.0, 3, False),
+        ("all", 20.0, 4, True),  # it would be adjusted again at once
+        ("all", 20.0, YOUNG + 1, True),
+        ("one", 20.0, YOUNG + 1, False),
+    ],
 )
-def test_what_was_adjusted_anew_in_the_meantime_is_not_put_back(since, cell, dropped):
-    """A job on three photos ends when twelve have been adjusted together: it would move them by
+def test_what_was_adjusted_anew_in_the_meantime_is_not_put_back(since, cell, block, dropped):
+    """A job on three photos ends when so many have been adjusted together: it would move them by
     4 m.
     """
 
@@ -80,6 +125,7 @@ def test_what_was_adjusted_anew_in_the_meantime_is_not_put_back(since, cell, dro
     before = {i: pose(10.0 * i) for i in (1, 2, 3)}
     now = {"none": (), "one": (2,), "all": (1, 2, 3)}[since]
     by_id = {i: SimpleNamespace(pose=pose(10.0 * i + (i in now))) for i in before}
+    by_id |= {i: SimpleNamespace(pose=None, links=()) for i in range(4, block + 1)}
     done = BlockAdjustment(
         ids=(1, 2, 3),
         poses={i: pose(10.0 * i + 5) for i in before},
@@ -90,10 +136,10 @@ def test_what_was_adjusted_anew_in_the_meantime_is_not_put_back(since, cell, dro
     )
     stored = []
     schedule = Schedule(since=4)
-    schedule.begun(1, 3)
+    schedule.begun(1, 3, sweep=False)
     refinement = SimpleNamespace(
         members=SimpleNamespace(
-            by_id=by_id, block=lambda i: {1, 2, 3}, save_cameras=lambda cameras: None
+            by_id=by_id, block=lambda i: set(range(1, block + 1)), save_cameras=lambda cameras: None
         ),
         ledger=SimpleNamespace(change=nullcontext, put_meta=lambda *a: None, tell=lambda *a: None),
         schedule=schedule,

@@ -2,6 +2,7 @@
 
 import time
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,8 +27,10 @@ class Schedule:
 
     closed_at: dict[int, int] = field(default_factory=dict)
     """Number of photos that each block had when it was last adjusted as a whole, by block name."""
+    swept_at: dict[int, int] = field(default_factory=dict)
+    """The same of the last time when ground heights were computed by plane sweep as well."""
     since: int = 0
-    """Number of photos refined since then."""
+    """Number of photos refined since a block was last adjusted."""
     loop: int | None = None
     """A photo that closed a loop which has not been adjusted yet."""
     checked: bool = True
@@ -43,9 +46,13 @@ class Schedule:
     def read(cls, ledger: Ledger) -> "Schedule":
         """Reads the state that was last stored."""
         found = ledger.meta(KEY) or {}
-        closed = {int(k): int(v) for k, v in found.get("closed_at", {}).items()}
+        closed, swept = (
+            {int(k): int(v) for k, v in found.get(key, {}).items()}
+            for key in ("closed_at", "swept_at")
+        )
         return cls(
             closed_at=closed,
+            swept_at=swept,
             since=int(found.get("since", 0)),
             loop=found.get("loop"),
             checked=bool(found.get("checked", True)),
@@ -58,7 +65,7 @@ class Schedule:
         if began is not None:
             record["since"] += began["since"]
             record["loop"] = record["loop"] if record["loop"] is not None else began["loop"]
-            record["closed_at"] = began["closed_at"]
+            record["closed_at"], record["swept_at"] = began["closed_at"], began["swept_at"]
         ledger.put_meta(KEY, record)
 
     def refined(self, photo: int, *, loop: bool) -> None:
@@ -67,10 +74,18 @@ class Schedule:
         if loop:
             self.loop = photo
 
-    def begun(self, block: int, size: int) -> None:
+    def begun(self, block: int, size: int, *, sweep: bool) -> None:
         """Notes that a job begins on a block of `size` photos."""
-        self.under_way = {"since": self.since, "loop": self.loop, "closed_at": dict(self.closed_at)}
+        before = {"closed_at": dict(self.closed_at), "swept_at": dict(self.swept_at)}
+        self.under_way = {"since": self.since, "loop": self.loop, **before}
         self.closed_at[block], self.since, self.loop = size, 0, None
+        if sweep:
+            self.swept_at[block] = size
+
+    def given_up(self, sizes: Mapping[int, int]) -> None:
+        """Notes that nothing is due on blocks of these sizes until the next photo."""
+        self.closed_at, self.swept_at = dict(sizes), dict(sizes)
+        self.since, self.loop = 0, None
 
     def ended(self) -> None:
         """Notes that the result of the job is about to be stored."""
@@ -97,12 +112,12 @@ class Blocks:
         """The block, or part of a block, that should be adjusted as a whole now; None where none is
         due. `ground`: height of the ground in m.
         """
-        if not self.settings.reposition or self.schedule.since == 0:
+        quiet = idle and time.monotonic() - self.last_arrival > QUIET_S
+        if not self.settings.reposition or not (quiet or self.schedule.since):
             return None
-        root = self._root()
+        root = self._root() if self.schedule.since else self._unfinished()
         block = self.members.block(root) if root in self.members.by_id else set[int]()
         name = self.members.block_of.get(root, root)
-        quiet = idle and time.monotonic() - self.last_arrival > QUIET_S
         grown = len(block) >= GROWTH * self.schedule.closed_at.get(name, 2)
         if len(block) < 3 or not (grown or self.schedule.loop is not None or quiet):
             return None
@@ -111,9 +126,10 @@ class Blocks:
             if not idle and self.schedule.loop is None and self.schedule.since < PART // 4:
                 return None
             ids, held = self._around(root)
-        job = self._job(ids, held, ground, sweep=quiet and not held and len(ids) <= SWEEPING)
+        sweep = quiet and not held and len(ids) <= SWEEPING
+        job = self._job(ids, held, ground, sweep=sweep)
         if job is not None:
-            self.schedule.begun(name, len(block))
+            self.schedule.begun(name, len(block), sweep=sweep)
         return job
 
     def _root(self) -> int:
@@ -124,11 +140,35 @@ class Blocks:
             return self.schedule.loop
         closed = self.schedule.closed_at
         grown = max(
-            self.members.blocks.items(),
+            self._on_map(),
             key=lambda b: (len(b[1]) / closed.get(b[0], 2), len(b[1]), -b[0]),
             default=(0, {0}),
         )
         return max(grown[1])
+
+    def _on_map(self) -> list[tuple[int, set[int]]]:
+        """Names and photos of the blocks that have a photo on the map. Nothing tells where the
+        others belong.
+        """
+        known = self.members.by_id
+        return [
+            (name, block)
+            for name, block in self.members.blocks.items()
+            if any(known[i].pose is not None for i in block)
+        ]
+
+    def _unfinished(self) -> int:
+        """The newest photo of a block that was not adjusted as it is now, or not with ground
+        heights by plane sweep; 0 where there is none. Larger blocks are adjusted in parts as they
+        grow.
+        """
+        closed, swept = self.schedule.closed_at, self.schedule.swept_at
+        for name, block in self._on_map():
+            size = len(block)
+            last = swept if size <= SWEEPING else closed
+            if 3 <= size <= CLOSING and last.get(name) != size:
+                return max(block)
+        return 0
 
     def _around(self, root: int) -> tuple[list[int], frozenset[int]]:
         """The photos that can be reached by the fewest links, and the ring of photos around them,

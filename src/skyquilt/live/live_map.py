@@ -276,7 +276,7 @@ class LiveMap:
             raise error
         log_error(self.folder, "a step of the live map", error)
         if self._failures > 1:  # perhaps an adjustment, which is due again with the next photo
-            self.schedule.since, self.schedule.loop = 0, None
+            self.schedule.given_up({k: len(v) for k, v in self.members.blocks.items()})
             self.schedule.write(self.ledger)
         text = f"a step failed ({type(error).__name__}) and is repeated; see {ERRORS}"
         self.ledger.tell("note", {"text": text})
