@@ -178,10 +178,17 @@ def _contradicts(pose: Pose, prior: Prior) -> bool:
     """
     if not told(prior):
         return False
-    reported = cam_R_map_from_angles(prior.yaw_deg, prior.pitch_deg, prior.roll_deg)
     away = np.linalg.norm((pose.map_C - prior.map_C) / prior.sigma_C)
-    turned = np.degrees(np.arccos(np.clip(pose.cam_R_map[2] @ reported[2], -1, 1)))
-    return bool(away > FAR_OFF and turned > TURNED_DEG)
+    return bool(away > FAR_OFF and turned(pose, prior))
+
+
+def turned(pose: Pose, prior: Prior) -> bool:
+    """Whether a photo looks far from where it reports to look; False where it does not."""
+    if not tells_angles(prior):
+        return False
+    reported = cam_R_map_from_angles(prior.yaw_deg, prior.pitch_deg, prior.roll_deg)
+    between = np.degrees(np.arccos(np.clip(pose.cam_R_map[2] @ reported[2], -1, 1)))
+    return bool(between > TURNED_DEG)
 
 
 def _points_of(

@@ -198,8 +198,8 @@ def reported_start(
 ) -> Start | None:
     """The start with linked photos where their metadata put them or, as far as these tell nothing,
     false headings or no position, `begun` does; photos whose pose is not known are left out. Where
-    the rays of these do not tell the height of the ground, since all were taken from one place, it
-    is taken for `ground_m`; None if that is not known either.
+    the rays of these do not tell the height of the ground, since they are few or all were taken
+    from one place, it is taken for `ground_m`; None if that is not known either.
     """
     priors = [begun.of(i, p) for i, p in enumerate(priors)]
     links = tuple(k for k in links if told(priors[k.a]) and told(priors[k.b]))
@@ -210,7 +210,8 @@ def reported_start(
     if not members:
         return None
     seen = float(np.median(meetings)) if len(meetings) >= FEWEST_MET else np.nan
-    if np.isnan(seen) and within_noise([priors[i] for i in members]):
+    few = sum(map(len, links)) < 2 * FEWEST_MET
+    if np.isnan(seen) and (few or within_noise([priors[i] for i in members])):
         seen = ground_m
     if np.isnan(seen):
         return None

@@ -14,7 +14,7 @@ from skyquilt.alignment.enlarged import enlarged_note, enlarged_photos, fits_bet
 from skyquilt.alignment.false_tilts import told_no_tilt
 from skyquilt.alignment.late_positions import as_moved, moved_note, on_time, unshifted
 from skyquilt.alignment.motion import Speeds
-from skyquilt.alignment.oblique import reported_oblique, without_photos
+from skyquilt.alignment.oblique import reported_oblique, turned, without_photos
 from skyquilt.alignment.oblique_guess import agrees, far_off, lowered, misled
 from skyquilt.alignment.oblique_start import (
     Beginnings,
@@ -137,20 +137,30 @@ def repaired(first: Tried, survey: Survey) -> Tried:
 
 def _as_reported(last: Tried, survey: Survey) -> Tried:
     """Photos that look somewhat aslant begin as they report: links of these, taken for similarities
-    of the ground's plane, may put them where positions look like gross errors, or contradict one
-    another. Photos that do not report their angles are hung on the others.
+    of the ground's plane, may put them where positions look like gross errors, contradict one
+    another, or turn them far from their angles. Photos that do not report their angles are hung on
+    the others.
     """
     priors = last.begun.priors
-    doubtful = len(last.found.blocks) > 1 or far_off(last.found, priors, AWAY)
-    if not (doubtful and aslant(priors)):
+    if not aslant(priors):
         return last
     begin = survey.beginnings(last)
+    angles = [begin.of(i, p) for i, p in enumerate(priors)]
+    away = turned_away(last.found, angles)
+    if not (away or len(last.found.blocks) > 1 or far_off(last.found, priors, AWAY)):
+        return last
     aside = last.begun.aside | (untold(priors) - begin.centres.keys())
     other = survey.tried(last.begun, in_space=begin, aside=aside, name="as reported ")
     before = without_photos(last.found, dict.fromkeys(aside, "hung on the others"))
-    if nearer(other.found, before, priors) and agrees(other.found, before):
+    as_told = turned_away(other.found, angles) < away and len(other.found.held) >= len(before.held)
+    if (as_told or nearer(other.found, before, priors)) and agrees(other.found, before):
         return other
     return last
+
+
+def turned_away(found: Alignment, priors: Sequence[Prior]) -> int:
+    """How many photos of an adjustment look far from where they report to look."""
+    return sum(turned(found.poses[i], priors[i]) for i in found.held)
 
 
 def _enlargements(last: Tried, survey: Survey) -> Tried:

@@ -53,6 +53,7 @@ class ApplyAdjustment:
             self.members.save_cameras(done.cameras)
             self.refinement.heights(done.xyz, done.poses, known=bool(done.cameras), together=True)
             self.refinement.move(done.poses, done.camera_of)
+            self.refinement.put_back(self._left(done))
             for member in since:
                 self._follow(member, steps)
             self.schedule.write(self.ledger)
@@ -80,6 +81,14 @@ class ApplyAdjustment:
         ]
         cell = self.refinement.local_pose.metadata.heights.cell
         return bool(off) and float(np.median(off)) > OUTDATED * cell
+
+    def _left(self, done: BlockAdjustment) -> dict[int, str]:
+        """Photos that the job could not hold, and that nothing has moved since it began."""
+        return {
+            i: why
+            for i, why in done.rejected.items()
+            if not _differs(self.members.by_id[i].pose, done.before.get(i))
+        }
 
     def _failed(self, problem: str) -> Update:
         self.schedule.ended()

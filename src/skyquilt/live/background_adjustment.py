@@ -89,6 +89,8 @@ class BlockAdjustment:
     """Name of the calibration of each moved photo."""
     xyz: NDArray[np.float64]
     """(P, 3) ground points in m."""
+    rejected: dict[int, str] = field(default_factory=dict)
+    """Photos that could not be held, with reasons."""
     before: dict[int, Pose] = field(default_factory=dict)
     """Poses when the job began."""
     problem: str = ""
@@ -157,6 +159,7 @@ def _whole(
         cameras=dict(done.cameras),
         camera_of={job.ids[k]: done.camera_of[k] for k in done.poses},
         xyz=xyz,
+        rejected={job.ids[k]: why for k, why in done.rejected.items()},
     )
 
 

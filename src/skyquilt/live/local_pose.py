@@ -1,7 +1,7 @@
 """The pose of a photo from its links: an adjustment with a bounded number of neighbours."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 
 import numpy as np
@@ -56,6 +56,8 @@ class Change:
     """Why the links do not determine the photo's pose; empty if they do."""
     observations: int = 0
     """Tie points of the photo; 0 = not told."""
+    rejected: dict[int, str] = field(default_factory=dict)
+    """Other photos that an adjustment of the whole block could not hold, with reasons."""
 
 
 class LocalPose:
@@ -160,13 +162,15 @@ class LocalPose:
             done = self.bundled(sorted(whole), good)
             if done is not None:
                 ids = sorted(whole)
+                rejected = {ids[k]: why for k, why in done.rejected.items()}
                 return Change(
                     moved={ids[k]: p for k, p in done.poses.items()},
                     cameras=dict(done.cameras),
                     camera_of={ids[k]: done.camera_of[k] for k in done.poses},
                     links=links,
                     xyz=done.ties.xyz,
-                    reason=done.rejected.get(ids.index(member.id), ""),
+                    reason=rejected.pop(member.id, ""),
+                    rejected=rejected,
                     observations=int((done.ties.photo == ids.index(member.id)).sum()),
                 )
         return self._adjusted_locally(member, links, good)

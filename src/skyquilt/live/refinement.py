@@ -87,6 +87,7 @@ class Refinement:
             whole = bool(change.cameras)
             self.heights(change.xyz, change.moved, known=whole, together=whole)
             self.move(change.moved, change.camera_of)
+            self.put_back(change.rejected)
             if member.state == "refined":
                 self._learn(member, loop=far)
             why = change.reason
@@ -150,6 +151,24 @@ class Refinement:
             self.local_pose.neighbours.indexed(member)
             if member.state == "refined":
                 self.redraw.moved(member)
+
+    def put_back(self, rejected: Mapping[int, str]) -> None:
+        """Photos that an adjustment of their whole block could not hold stand where their metadata
+        put them again (inside a transaction): the pose that they had may rest on matches or on a
+        start that the others prove wrong. `rejected`: why each was not held. Those without a
+        position stay.
+        """
+        for i, why in rejected.items():
+            member = self.members.by_id[i]
+            first = self.local_pose.metadata.first(member)
+            if member.state != "refined" or first is None:
+                continue
+            member.pose, member.state = first, "placed"
+            member.learned = None
+            self.members.save(member, about=about_record(member, why), reason=why)
+            self.map_events.photo(member, reason=why)
+            self.local_pose.neighbours.indexed(member)
+            self.redraw.moved(member)
 
     def heights(
         self,
