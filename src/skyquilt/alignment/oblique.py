@@ -179,16 +179,17 @@ def _contradicts(pose: Pose, prior: Prior) -> bool:
     if not told(prior):
         return False
     away = np.linalg.norm((pose.map_C - prior.map_C) / prior.sigma_C)
-    return bool(away > FAR_OFF and turned(pose, prior))
+    return bool(away > FAR_OFF and turned_deg(pose, prior) > TURNED_DEG)
 
 
-def turned(pose: Pose, prior: Prior) -> bool:
-    """Whether a photo looks far from where it reports to look; False where it does not."""
+def turned_deg(pose: Pose, prior: Prior) -> float:
+    """Angle in degrees between where a photo looks and where it reports to look; 0 where it does
+    not report its attitude.
+    """
     if not tells_angles(prior):
-        return False
+        return 0.0
     reported = cam_R_map_from_angles(prior.yaw_deg, prior.pitch_deg, prior.roll_deg)
-    between = np.degrees(np.arccos(np.clip(pose.cam_R_map[2] @ reported[2], -1, 1)))
-    return bool(between > TURNED_DEG)
+    return float(np.degrees(np.arccos(np.clip(pose.cam_R_map[2] @ reported[2], -1, 1))))
 
 
 def _points_of(

@@ -9,12 +9,13 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from skyquilt.alignment.crowded_positions import believed
+from skyquilt.alignment.determined import STATED_DEG
 from skyquilt.alignment.displaced_parts import as_taken, brought_together
 from skyquilt.alignment.enlarged import enlarged_note, enlarged_photos, fits_better
 from skyquilt.alignment.false_tilts import told_no_tilt
 from skyquilt.alignment.late_positions import as_moved, moved_note, on_time, unshifted
 from skyquilt.alignment.motion import Speeds
-from skyquilt.alignment.oblique import reported_oblique, turned, without_photos
+from skyquilt.alignment.oblique import reported_oblique, turned_deg, without_photos
 from skyquilt.alignment.oblique_guess import agrees, far_off, lowered, misled
 from skyquilt.alignment.oblique_start import (
     Beginnings,
@@ -159,8 +160,8 @@ def _as_reported(last: Tried, survey: Survey) -> Tried:
 
 
 def turned_away(found: Alignment, priors: Sequence[Prior]) -> int:
-    """How many photos of an adjustment look far from where they report to look."""
-    return sum(turned(found.poses[i], priors[i]) for i in found.held)
+    """How many photos of an adjustment look elsewhere than they report, further than these err."""
+    return sum(turned_deg(found.poses[i], priors[i]) > STATED_DEG for i in found.held)
 
 
 def _enlargements(last: Tried, survey: Survey) -> Tried:
