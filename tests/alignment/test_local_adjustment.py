@@ -1,0 +1,80 @@
+"""A photo joins placed ones that look aslant, each in another direction, as drones without a gimbal
+do.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from skyquilt.alignment.local_adjustment import LocalAdjustment, NotAdjusted, Window
+from skyquilt.model.features import Link
+from tests.alignment.test_oblique_start import CAMERA, Slanting
+
+AROUND = [
+    (-35.0, -15.0, 50.0, 80.0, 25.0),
+    (0.0, -18.0, 52.0, 95.0, -25.0),
+    (35.0, -16.0, 50.0, 88.0, 17.5),
+    (-28.0, 14.0, 49.0, 270.0, -25.0),
+    (5.0, 12.0, 51.0, 262.0, 25.0),
+]
+"""x, y, z in m, heading and pitch in degrees."""
+
+
+def window(pitch_deg, sigma_tilt_deg=1.0, seed=1):
+    flown = Slanting([*AROUND, (-2.0, -1.0, 50.0, 80.0, pitch_deg)], seed=seed, alike_deg=180)
+    new = len(AROUND)
+    key = flown.photos[0].camera_key
+    flown.priors[new] = replace(flown.priors[new], sigma_tilt_deg=sigma_tilt_deg)
+    return flown, Window(
+        photos=flown.photos,
+        priors=flown.priors,
+        features=flown.features,
+        links=flown.links,
+        poses=dict(enumerate(flown.truth[:new])),
+        cameras={key: CAMERA},
+        camera_of=dict.fromkeys(range(new), key),
+        new=new,
+        held=frozenset(range(new)),
+        ground=0.0,
+        sigma_xy=0.0,
+    )
+
+
+def off(flown, done, new):
+    R = done.poses[new].cam_R_map @ flown.truth[new].cam_R_map.T
+    turned = np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
+    return float(np.linalg.norm(done.poses[new].map_C - flown.truth[new].map_C)), turned
+
+
+@pytest.mark.parametrize("pitch_deg", [-25.0, 0.0, 25.0, 35.0])
+def test_links_of_a_tilted_photo_agree_with_one_another(pitch_deg):
+    """Taken for similarities of the picture itself, two of three contradicted one another:
+    they were given up, and the photo hung on the third.
+    """
+    flown, asked = window(pitch_deg)
+    done = LocalAdjustment()(asked)
+    assert not done.dropped
+    away, turned = off(flown, done, asked.new)
+    assert away < 0.15 and turned < 0.15
+
+
+def test_a_photo_that_does_not_tell_its_tilt_is_taken_to_look_down():
+    flown, asked = window(4.0, sigma_tilt_deg=30.0)
+    away, turned = off(flown, LocalAdjustment()(asked), asked.new)
+    assert away < 0.3 and turned < 0.3
+
+
+def test_a_link_with_another_place_is_dropped():
+    flown, asked = window(20.0)
+    new, features = asked.new, asked.features
+    wrong = next(k for k in asked.links if k.b == new)
+    aside = features[wrong.a].px[wrong.index_a] + [250, 0]
+    near = np.array([np.argmin(np.hypot(*(features[wrong.a].px - p).T)) for p in aside])
+    false = Link(a=wrong.a, b=new, index_a=near, index_b=wrong.index_b, b_S_a=wrong.b_S_a)
+    links = [false if k is wrong else k for k in asked.links]
+    done = LocalAdjustment()(replace(asked, links=links))
+    assert done.dropped == ((wrong.a, new),)
+    assert off(flown, done, new)[0] < 0.3
+    alone = LocalAdjustment()(replace(asked, links=[]))
+    assert isinstance(alone, NotAdjusted)
