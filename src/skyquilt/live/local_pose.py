@@ -208,17 +208,13 @@ class LocalPose:
         good: dict[tuple[int, int], Link],
     ) -> Change:
         """Adjusts a photo that joins a larger block together with its neighbours; all photos around
-        them are held fixed.
+        them are held fixed. Neighbours that stand where their metadata put them, so that nothing
+        could rest on them, move first.
         """
         direct = sorted({a for a, _ in good if self.members.by_id[a].pose is not None})
-        by_strength = sorted(direct, key=lambda a: (-len(good[a, member.id]), a))
+        by_strength = sorted(direct, key=lambda a: (self._adjusted(a), -len(good[a, member.id]), a))
         moving = set(by_strength[:MOVING]) if self.settings.reposition else set()
-        ring = {
-            j
-            for i in moving
-            for j in self.members.by_id[i].links
-            if self.members.by_id[j].pose is not None
-        }
+        ring = {j for i in moving for j in self.members.by_id[i].links if self._adjusted(j)}
         ring -= {member.id, *direct}
         kept = sorted(ring, key=lambda j: (-len(self.members.by_id[j].links & moving), j))[:RING]
         ids = sorted({member.id, *direct, *kept})
@@ -240,6 +236,11 @@ class LocalPose:
             xyz=done.xyz,
             observations=done.observations,
         )
+
+    def _adjusted(self, photo: int) -> bool:
+        """Whether a photo stands where an adjustment put it."""
+        member = self.members.by_id[photo]
+        return member.pose is not None and member.state != "placed"
 
     def window(
         self, member: Member, ids: Sequence[int], held: frozenset[int], more: Sequence[Link]

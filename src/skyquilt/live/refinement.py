@@ -5,6 +5,8 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.determined import STATED_DEG
+from skyquilt.alignment.oblique import FAR_OFF, turned_deg
 from skyquilt.geometry.neighbours import nearest
 from skyquilt.live.adjustment_schedule import Schedule
 from skyquilt.live.blur import LiveBlur
@@ -153,15 +155,21 @@ class Refinement:
                 self.redraw.moved(member)
 
     def put_back(self, rejected: Mapping[int, str]) -> None:
-        """Photos that an adjustment of their whole block could not hold stand where their metadata
-        put them again (inside a transaction): the pose that they had may rest on matches or on a
-        start that the others prove wrong. `rejected`: why each was not held. Those without a
-        position stay.
+        """Photos that an adjustment of their whole block could not hold, and that lie or look
+        elsewhere than they report, stand where their metadata put them again (inside a
+        transaction): the pose that they had rests on matches or on a start that the others prove
+        wrong. `rejected`: why each was not held.
         """
         for i, why in rejected.items():
             member = self.members.by_id[i]
             first = self.local_pose.metadata.first(member)
-            if member.state != "refined" or first is None:
+            if member.state != "refined" or member.pose is None or first is None:
+                continue
+            away = np.hypot(*(member.pose.map_C - first.map_C)[:2])
+            if (
+                turned_deg(member.pose, member.prior) <= STATED_DEG
+                and away <= FAR_OFF * member.prior.sigma_C[0]
+            ):
                 continue
             member.pose, member.state = first, "placed"
             member.learned = None
