@@ -145,6 +145,35 @@ def test_photos_that_look_somewhat_aslant_are_placed_by_what_they_report(pitch, 
     assert np.median(flown.errors(found)[1]) < 2.0
 
 
+def two_aslant(pitches, *, height, seed, matches, gps):
+    """Two photos 18 m apart that look aslant by so many degrees, and few matches."""
+    places = [(18.0 * k, 2.0 * k, height, -85.0 + k, pitch) for k, pitch in enumerate(pitches)]
+    flown = Slanting(places, seed=seed, alike_deg=180, gps=gps)
+    flown.links = [
+        replace(k, index_a=k.index_a[:matches], index_b=k.index_b[:matches]) for k in flown.links
+    ]
+    return flown
+
+
+@pytest.mark.parametrize(
+    ("pitches", "height", "seed", "matches", "gps", "most_deg"),
+    [((20, 10), 60.0, 1, 46, 2.5, 4.0), ((36, 18), 50.0, 2, 40, 2.0, 9.0)],
+)
+def test_two_photos_that_look_aslant_begin_as_they_report(
+    pitches, height, seed, matches, gps, most_deg
+):
+    """Taken for a similarity, their link turned them by 30 degrees, and 10 and 17 from their
+    angles; those that look aslant by much were begun so where few rays told the ground.
+    """
+    flown = two_aslant(pitches, height=height, seed=seed, matches=matches, gps=gps)
+    found = flown.aligned()
+    off = [
+        np.degrees(np.arccos(np.clip(p.cam_R_map[2] @ flown.truth[i].cam_R_map[2], -1, 1)))
+        for i, p in found.poses.items()
+    ]
+    assert len(off) == 2 and max(off) < most_deg
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("pitch", [25, 32])
 def test_photos_without_angles_among_those_that_look_aslant_hang_on_them(pitch):

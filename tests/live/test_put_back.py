@@ -1,0 +1,106 @@
+"""Photos that an adjustment of their block cannot hold."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from skyquilt.geometry.frames import rotation_from_vector
+from skyquilt.live.background_adjustment import BlockAdjustment
+from skyquilt.live.live_map import LiveMap
+from skyquilt.live.settings import LiveSettings
+
+
+@pytest.fixture(scope="module")
+def four(flight, tmp_path_factory):
+    """Four photos."""
+    folder = tmp_path_factory.mktemp("live") / "out"
+    live = LiveMap(folder, LiveSettings(features=600, deterministic=True))
+    for path in flight.photos[:4]:
+        live.add(path)
+    yield live
+    live.close()
+
+
+@pytest.fixture
+def live(four):
+    """The same, as they stood before each test."""
+    stood = [(m, m.pose, m.state, m.learned) for m in four.members.by_id.values()]
+    yield four
+    for member, pose, state, learned in stood:
+        member.pose, member.state, member.learned = pose, state, learned
+
+
+def turned(pose, degrees):
+    R = rotation_from_vector(np.array([[np.radians(degrees), 0.0, 0.0]]))[0]
+    return replace(pose, cam_R_map=R @ pose.cam_R_map)
+
+
+def without(young, name):
+    """An adjustment that does not hold a photo."""
+
+    def adjusted(photos, *rest):
+        done = young(photos, *rest)
+        out = next(i for i, p in enumerate(photos) if p.name == name)
+        poses = {i: p for i, p in done.poses.items() if i != out}
+        return replace(done, poses=poses, rejected={out: "too few"})
+
+    return adjusted
+
+
+@pytest.mark.parametrize(("degrees", "back"), [(15.0, True), (0.0, False)])
+def test_a_photo_that_looks_elsewhere_than_it_reports_goes_back(live, monkeypatch, degrees, back):
+    """It kept the pose that it had from two photos, 19 degrees off, and counted as refined."""
+    second, pose = live.members.by_id[2], live.refinement.local_pose
+    second.pose = turned(second.pose, degrees)
+    stood = second.pose
+    monkeypatch.setattr(pose, "young", without(pose.young, second.photo.name))
+    live.queues.untried.append(live.members.by_id[4])
+    assert live.refinement.refine(live.members.by_id[4]).what == "refined"
+    assert second.state == ("placed" if back else "refined")
+    kept = pose.metadata.first(second) if back else stood
+    assert np.array_equal(second.pose.cam_R_map, kept.cam_R_map)
+    if back:
+        stored = live.ledger.row("select state, reason from photo where id = 2")
+        assert tuple(stored) == ("placed", "too few")
+
+
+@pytest.mark.parametrize("since", [False, True])
+def test_a_whole_adjustment_puts_back_what_nothing_has_moved_since(live, since):
+    members, apply = live.members, live.apply_adjustment
+    before = {i: turned(m.pose, 15.0) for i, m in members.by_id.items()}
+    for i, m in members.by_id.items():
+        m.pose = before[i]
+    done = BlockAdjustment(
+        ids=(1, 2, 3, 4),
+        poses={i: before[i] for i in (1, 3, 4)},
+        cameras={},
+        camera_of={},
+        xyz=np.zeros((0, 3)),
+        before=before,
+        rejected={2: "too few"},
+    )
+    if since:
+        members.by_id[2].pose = turned(before[2], 1.0)
+    apply.apply(done)
+    assert members.by_id[2].state == ("refined" if since else "placed")
+
+
+def test_neighbours_placed_by_their_metadata_move_and_hold_nothing(live, monkeypatch):
+    local, members = live.refinement.local_pose, live.members
+    members.by_id[1].state = "placed"
+    asked = []
+
+    def stop(window):
+        asked.append(window)
+        return SimpleNamespace(reason="that is enough")
+
+    monkeypatch.setattr(local, "adjust_locally", stop)
+    links = {(i, 4): local.live_links.link(i, 4) for i in (1, 2, 3)}
+    good = {key: k for key, k in links.items() if k is not None}
+    local._adjusted_locally(members.by_id[4], links, good)
+    names = [p.name for p in asked[0].photos]
+    first = members.by_id[1].photo.name
+    assert (1, 4) in good and names.index(first) not in asked[0].held
+    assert asked[0].held
