@@ -148,6 +148,7 @@ def test_what_was_adjusted_anew_in_the_meantime_is_not_put_back(since, cell, blo
         queues=None,
         heights=lambda *a, **k: None,
         move=lambda poses, camera_of: stored.append(poses),
+        put_back=lambda rejected: None,
     )
     update = ApplyAdjustment(refinement).apply(done)
     assert bool(stored) != dropped
