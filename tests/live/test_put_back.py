@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from skyquilt.alignment.local_adjustment import AdjustedWindow
 from skyquilt.geometry.frames import rotation_from_vector
 from skyquilt.live.background_adjustment import BlockAdjustment
 from skyquilt.live.live_map import LiveMap
@@ -97,10 +98,32 @@ def test_neighbours_placed_by_their_metadata_move_and_hold_nothing(live, monkeyp
         return SimpleNamespace(reason="that is enough")
 
     monkeypatch.setattr(local, "adjust_locally", stop)
-    links = {(i, 4): local.live_links.link(i, 4) for i in (1, 2, 3)}
-    good = {key: k for key, k in links.items() if k is not None}
-    local._adjusted_locally(members.by_id[4], links, good)
+    good = {(i, 4): local.live_links.link(i, 4) for i in (1, 2, 3)}
+    local._adjusted_locally(members.by_id[4], dict(good), good)
     names = [p.name for p in asked[0].photos]
     first = members.by_id[1].photo.name
-    assert (1, 4) in good and names.index(first) not in asked[0].held
+    assert names.index(first) not in asked[0].held
     assert asked[0].held
+
+
+@pytest.mark.parametrize(
+    ("step_m", "degrees", "held"), [(0.1, 0.5, 1), (3.0, 0.0, 3), (0.0, 5.0, 3)]
+)
+def test_a_photo_does_not_turn_its_neighbours_over(live, monkeypatch, step_m, degrees, held):
+    """One that moved along was turned by 12 degrees, where two photos alone held it."""
+    local, members = live.refinement.local_pose, live.members
+    asked = []
+
+    def adjusted(window):
+        asked.append(len(window.held))
+        free = [k for k in range(len(window.photos)) if k not in window.held]
+        poses = {k: members.by_id[k + 1].pose for k in free}
+        poses = {k: turned(replace(p, map_C=p.map_C + step_m), degrees) for k, p in poses.items()}
+        return AdjustedWindow(
+            poses=poses, camera="", observations=50, xyz=np.zeros((0, 3)), dropped=()
+        )
+
+    monkeypatch.setattr(local, "adjust_locally", adjusted)
+    good = {(i, 4): local.live_links.link(i, 4) for i in (1, 2, 3)}
+    change = local._adjusted_locally(members.by_id[4], dict(good), good)
+    assert asked[-1] == held and len(change.moved) == 4 - held

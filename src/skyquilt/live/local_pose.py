@@ -26,6 +26,10 @@ RING = 8
 """Number of photos held fixed around those that may move."""
 MOVING = 2
 """Number of linked photos that are adjusted together with a new one."""
+STRAY_HIGH, STRAY_DEG = 0.02, 2.0
+"""Share of the flying height, and angle in degrees, by which a new photo may move a neighbour; more
+is no correction of what stood there, but a neighbour that little holds.
+"""
 NO_MAP = "no photo has a position so far, and too few overlap for a map without a place"
 MISLED = (
     "by its matches the photos around it would lie elsewhere than their positions: they are of"
@@ -222,6 +226,11 @@ class LocalPose:
         # links with photos that have no pose, as those that wait, tell nothing here
         usable = [k for (a, _), k in good.items() if a in direct]
         done = self.adjust_locally(self.window(member, ids, held, usable))
+        if isinstance(done, AdjustedWindow) and self._strays(
+            {ids[k]: p for k, p in done.poses.items() if ids[k] != member.id}
+        ):  # little holds a neighbour where the two meet, and it stood better
+            stood = frozenset(k for k in moving if self._adjusted(k))
+            done = self.adjust_locally(self.window(member, ids, held | stood, usable))
         if not isinstance(done, AdjustedWindow):
             return _unmoved(links, done.reason)
         for key in done.dropped:
@@ -241,6 +250,21 @@ class LocalPose:
         """Whether a photo stands where an adjustment put it."""
         member = self.members.by_id[photo]
         return member.pose is not None and member.state != "placed"
+
+    def _strays(self, moved: Mapping[int, Pose]) -> bool:
+        """Whether one photo makes others leave the poses in which they were adjusted before, with
+        more neighbours than it brings.
+        """
+        for i, pose in moved.items():
+            stood = self.members.by_id[i].pose
+            if stood is None or not self._adjusted(i):
+                continue
+            high = max(float(stood.map_C[2]) - self.metadata.ground_at(stood.map_C), 1.0)
+            away = float(np.linalg.norm(pose.map_C - stood.map_C))
+            cosine = float(np.clip(pose.cam_R_map[2] @ stood.cam_R_map[2], -1, 1))
+            if away > STRAY_HIGH * high or np.degrees(np.arccos(cosine)) > STRAY_DEG:
+                return True
+        return False
 
     def window(
         self, member: Member, ids: Sequence[int], held: frozenset[int], more: Sequence[Link]
