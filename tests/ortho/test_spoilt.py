@@ -11,7 +11,7 @@ from PIL import Image
 
 from skyquilt.imaging.blank import around, joined
 from skyquilt.imaging.views import make_views
-from skyquilt.ortho.spoilt import spoilt_parts
+from skyquilt.ortho.spoilt import coarser_parts, spoilt_parts
 from skyquilt.ortho.tie_surface import level
 from skyquilt.settings import MosaicSettings
 from skyquilt.simulate import preset, simulate
@@ -139,6 +139,23 @@ def test_dust_yields_where_all_photos_show_it():
     assert shown(alignment, clean) == ({}, ())
 
 
+def test_what_a_hover_shows_at_one_place_is_no_dust():
+    """Twelve photos of one place beside twelve of a line: they alone show a dark car."""
+    alignment = flight(12, apart=6.0)
+    rng = np.random.default_rng(3)
+    hover = {
+        k: replace(alignment.poses[2], map_C=alignment.poses[2].map_C + [*rng.normal(0, 0.2, 2), 0])
+        for k in range(12, 24)
+    }
+    poses = {**alignment.poses, **hover}
+    camera_of = dict.fromkeys(poses, "one")
+    alignment = replace(alignment, poses=poses, camera_of=camera_of, blocks=(tuple(poses),))
+    taken = pictures(alignment)
+    for k in hover:
+        taken[k][130:160, 190:240] //= 2
+    assert shown(alignment, taken) == ({}, ())
+
+
 @pytest.mark.parametrize("apart", [30.0, 70.0])
 def test_ground_that_two_photos_show_or_one_tells_of_no_spots(apart):
     alignment = flight(12, apart=apart)
@@ -155,3 +172,58 @@ def test_a_road_in_the_middle_of_every_picture_is_no_dust():
     middle = np.mean([p[140:160, 50:350].mean() / p.mean() for p in along.values()])
     assert middle < 0.8  # it is there
     assert shown(flight(10, apart=4.0), along) == ({}, ())
+
+
+def of_two_cameras(alignment, odd, factor):
+    """The alignment with its odd photos, and one tie point below each, by a camera whose pictures
+    are smaller by a factor, from the heights `odd` above them.
+    """
+    small = alignment.cameras["one"].rescaled(round(400 / factor), round(300 / factor))
+    camera_of = {k: "small" if k % 2 else "one" for k in alignment.poses}
+    poses = {
+        k: replace(p, map_C=p.map_C + [0, 0, odd if k % 2 else 0.0])
+        for k, p in alignment.poses.items()
+    }
+    places = np.array([p.map_C * [1, 1, 0] for p in alignment.poses.values()])
+    number = np.arange(len(places))
+    ties = replace(
+        alignment.ties,
+        xyz=places,
+        point=number,
+        photo=number,
+        px=np.zeros((len(places), 2)),
+        residual_px=np.zeros((len(places), 2)),
+    )
+    cameras = {**alignment.cameras, "small": small}
+    return replace(alignment, poses=poses, cameras=cameras, camera_of=camera_of, ties=ties)
+
+
+@pytest.mark.parametrize(("odd", "factor"), [(0.0, 2.0), (40.0, 1.0), (20.0, 1.33)])
+def test_photos_yield_where_others_are_much_finer(odd, factor):
+    """Every other photo of a line is smaller or higher up, or both: it yields where the others show
+    the ground, and they to none.
+    """
+    alignment = of_two_cameras(flight(10, apart=9.0), odd, factor)
+    marks, notes = coarser_parts(alignment, make_views(alignment, level(0.0)), "abcdefghij")
+    assert sorted(marks) == [1, 3, 5, 7, 9]
+    yields = marks[5].at(np.full(3, 200 / factor), np.array([10.0, 150.0, 290.0]) / factor) < 0
+    assert yields[1] and (odd == 0 or not (yields[0] or yields[2]))  # higher up, it sees more
+    assert len(notes) == 1 and "pixels 2.0 times as large" in notes[0]
+
+
+def test_photos_along_a_slope_are_equally_fine():
+    """Lines 40 m above a slope of 30 degrees, 12 m apart: those farther up do not make others
+    yield.
+    """
+    alignment = flight(50)
+    rise = np.array([0, np.tan(np.radians(30)), 0.0])
+    poses = {
+        k: replace(p, map_C=p.map_C + [0, 0, rise @ p.map_C]) for k, p in alignment.poses.items()
+    }
+    number = np.arange(50)
+    below = np.array([p.map_C - [0, 0, 40.0] for p in poses.values()])
+    none = np.zeros((50, 2))
+    ties = replace(alignment.ties, xyz=below, point=number, photo=number, px=none, residual_px=none)
+    alignment = replace(alignment, poses=poses, ties=ties)
+    views = make_views(alignment, level(14.0))
+    assert coarser_parts(alignment, views, [f"{k}" for k in range(50)]) == ({}, ())

@@ -120,7 +120,7 @@ def find_ground(
             f" half of the photos look {_usual_tilt_deg(alignment):.0f} degrees or more away from"
             " straight down; check their gimbal angles with `skyquilt inspect`"
         )
-    native = native_gsd(rough, flat)
+    native = native_gsd(_most_shown(rough), flat)
     gsd = picture.gsd_cm / 100 if picture.gsd_cm else round_gsd(native)
     gsd = gsd if earlier is None else earlier.grid.gsd
     bounds = _local_bounds(picture, alignment)
@@ -185,6 +185,15 @@ def find_ground(
         key=key,
         notes=notes,
     )
+
+
+def _most_shown(views: Sequence[View]) -> Sequence[View]:
+    """The views that yield to others on less than half of their picture: the map's pixels are as
+    large as theirs. All, where each yields.
+    """
+    marks = [v.limits.mark for v in views]
+    shown = [v for v, m in zip(views, marks, strict=True) if m is None or (m.room < 0).mean() < 0.5]
+    return shown or views
 
 
 def _blanks(

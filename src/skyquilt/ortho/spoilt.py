@@ -1,5 +1,5 @@
-"""What photos show badly, so that others are drawn in their place: marks, blur, spots, veils, and
-what is overexposed.
+"""What photos show badly, so that others are drawn in their place: marks, blur, spots, veils, what
+is overexposed, and what other photos show much finer.
 
 Dust on a lens or a sensor darkens the same place of every picture. What a photo shows there is
 darker than what others show of the same ground, and than what lies beside it in the picture.
@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.imaging.blank import Blank, around, joined
-from skyquilt.imaging.nodes import View
-from skyquilt.imaging.views import make_views
+from skyquilt.imaging.nodes import View, project_all
+from skyquilt.imaging.views import make_views, on_ground
 from skyquilt.model.poses import Alignment
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.exposure import Balance, Samples
@@ -37,6 +37,10 @@ DARKER, SURELY = 0.06, 6.0
 """A cell is darkened by a spot where its median lies so far, in log odds, and by so many of its
 standard deviations below those around: dust takes 0.2 to 0.5.
 """
+APART = 0.03
+"""Two photos of a camera are compared whose places differ by more than this share of their height,
+about.
+"""
 WITHIN, FEWEST_VALUES = 9, 8
 """Cells along a side of these, and fewest values of a cell."""
 RINGS = 12
@@ -49,6 +53,14 @@ root of their number.
 """
 ROUNDS = 3
 """Rounds in which photos' and points' brightness are told apart."""
+MUCH_FINER = 1.7
+"""A photo yields where others show the same ground by pixels so many times smaller: those of
+another camera, or of a flight at half the height.
+"""
+HIGHEST = 0.99
+"""Quantile of the heights of tie points that is the highest ground."""
+FINER_CELLS = 24
+"""Cells along the longer side of a picture that are compared."""
 
 
 def spoilt_parts(
@@ -74,7 +86,8 @@ def spoilt_parts(
         notes += (overexposed_note([names[i] for i in white]),)
     xyz = alignment.ties.xyz
     flat = level(float(np.median(xyz[:, 2])) if len(xyz) else 0.0)
-    views = [v for v in make_views(alignment, flat) if v.photo in of_8_bits]
+    placed = make_views(alignment, flat)
+    views = [v for v in placed if v.photo in of_8_bits]
     spots, told = find_spots(alignment, views, flat, thumbnails)
     notes += told
     # what is overexposed or blurred has little contrast as well, and was told; a drop is not all
@@ -82,10 +95,92 @@ def spoilt_parts(
     veiled = veiled_parts(views, xyz, thumbnails, fixed, spoilt=pale) if len(xyz) else {}
     if unnamed := sorted(veiled.keys() - pale):
         notes += (veiled_note([names[i] for i in unnamed]),)
+    coarse, told = coarser_parts(alignment, placed, names)
+    notes += told
     out = dict(fixed)
-    for found in (blurred, white, spots, veiled):
+    for found in (blurred, white, spots, veiled, coarse):
         out |= {i: joined(out[i], b) if i in out else b for i, b in found.items()}
     return out, notes
+
+
+def coarser_parts(
+    alignment: Alignment, views: Sequence[View], names: Sequence[str]
+) -> tuple[dict[int, Blank], tuple[str, ...]]:
+    """Where photos show ground that others, linked by tie points, show much finer, by photo
+    (index), and a note. `names` of the photos.
+
+    Photos are compared at the ground below each, as wide as a pixel is there, and those that show
+    it finer by the longer side of a pixel: on a slope, photos farther up are nearer to the ground
+    beside them, but look at it flatly.
+    """
+    high = np.array([v.pose.map_C[2] for v in views])
+    focal = np.array([v.camera.focal for v in views])
+    z = alignment.ties.xyz[:, 2]
+    top = float(np.quantile(z, HIGHEST)) if len(z) else 0.0
+    if (
+        not views
+        or MUCH_FINER * (high.min() - top) * focal.min() >= (high.max() - top) * focal.max()
+    ):
+        return {}, ()  # as in most surveys: nothing need be sorted by photo
+    held = set(alignment.held)
+    ground = _ground_below(alignment, [v.photo for v in views])
+    low, up = (np.array([f(v.footprint, axis=0) for v in views]) for f in (np.min, np.max))
+    linked = np.array([v.photo in held for v in views])
+    found, factors = dict[int, Blank](), list[float]()
+    for k, view in enumerate(views):
+        size = (high[k] - ground[k]) / focal[k]
+        above = high - ground[k]
+        finer = linked & (above > 0) & (MUCH_FINER * above < size * focal)
+        finer &= ((low < up[k]) & (up > low[k])).all(1)
+        if not size > 0 or not finer.any():
+            continue
+        others = [views[j] for j in np.flatnonzero(finer).tolist()]
+        mask, factor = _finer_shown(view, size, others, ground[k])
+        if mask.any():
+            found[view.photo] = around(mask, (view.camera.width, view.camera.height))
+            factors.append(factor)
+    if not found:
+        return {}, ()
+    return found, (
+        f"{len(found)} photos show ground by pixels {np.median(factors):.1f} times as large as"
+        f" others show it ({sentence_of([names[i] for i in found])}): another camera, or a higher"
+        " flight. They are drawn only where no finer photo shows the ground.",
+    )
+
+
+def _ground_below(alignment: Alignment, photos: Sequence[int]) -> NDArray[np.float64]:
+    """Heights (n,) in m of the ground that photos show: the median of their tie points, and of all
+    where they have none.
+    """
+    ties = alignment.ties
+    usual = float(np.median(ties.xyz[:, 2])) if len(ties.xyz) else 0.0
+    own = ties.of_photos(photos)
+    z = (ties.xyz[ties.point[own[i]], 2] for i in photos)
+    return np.array([float(np.median(n)) if len(n) else usual for n in z])
+
+
+def _finer_shown(
+    view: View, size: float, others: Sequence[View], height: float
+) -> tuple[NDArray[np.bool_], float]:
+    """Cells (h, w) of a photo whose ground, at this height in m, others show much finer than by
+    pixels of this size in m; and by what factor, in the median.
+    """
+    camera = view.camera
+    cell = max(camera.width, camera.height) / FINER_CELLS
+    h, w = (max(2, round(n / cell)) for n in (camera.height, camera.width))
+    v, u = (np.mgrid[:h, :w] + 0.5) / np.array([h, w])[:, None, None]
+    px = np.stack([u * camera.width, v * camera.height], -1).reshape(-1, 2) - 0.5
+    x, y, z = on_ground(view, px, level(height)).T.reshape(3, h, w)
+    own, *rest = project_all([view, *others], x, y, z)
+    finest, beneath = np.full((h, w), np.inf), np.full((h, w), np.inf)
+    for nodes in rest:
+        straight = (nodes.view.pose.map_C[2] - height) / nodes.view.camera.focal
+        longer = straight * (1 + nodes.score)
+        better = nodes.seen & (longer < finest)
+        finest = np.where(better, longer, finest)
+        beneath = np.where(better, straight, beneath)
+    mask = own.seen & (finest * MUCH_FINER < size)
+    return mask, float(np.median(size / beneath[mask])) if mask.any() else 1.0
 
 
 def overexposed_note(names: Sequence[str]) -> str:
@@ -119,15 +214,16 @@ def find_spots(
     """Dark spots at the same place of all pictures of a camera, by photo (index), and notes.
     `views` of level ground, `flat`; `thumbnails`: (h, w[, bands]) of their photos, of 8 bits.
     """
-    if len(views) < FEWEST_SPOILT:
+    apart = _apart(alignment, views, flat)
+    if len(apart) < FEWEST_SPOILT:
         return {}, ()
-    outline = np.concatenate([v.footprint for v in views])
+    outline = np.concatenate([v.footprint for v in apart])
     (west, south), (east, north) = outline.min(0), outline.max(0)
     samples = Balance(points=SPOT_POINTS).samples(
-        views, InGrey(thumbnails), flat, (west, south, east, north)
+        apart, InGrey(thumbnails), flat, (west, south, east, north)
     )
-    darker = _darker(samples, len(views))
-    cameras = np.array([alignment.camera_of[v.photo] for v in views])
+    darker = _darker(samples, len(apart))
+    cameras = np.array([alignment.camera_of[v.photo] for v in apart])
     found, notes = dict[int, Blank](), list[str]()
     for name in dict.fromkeys(cameras.tolist()):
         own = cameras == name
@@ -140,13 +236,29 @@ def find_spots(
         spot = _spots(samples.place[here], darker[here], size)
         if spot.any():
             mark = around(np.kron(spot, np.ones((FINER, FINER))) > 0, size)
-            found |= {v.photo: mark for v, mine in zip(views, own, strict=True) if mine}
+            found |= {v.photo: mark for v in views if alignment.camera_of[v.photo] == name}
             notes.append(
                 f"Photos of {name} are darkened at the same place of every picture, on"
                 f" {100 * spot.mean():.1f} % of it: dust on the lens or the sensor, or the drone's"
                 " own shadow. It is drawn only where no other photo shows the ground."
             )
     return found, tuple(notes)
+
+
+def _apart(alignment: Alignment, views: Sequence[View], flat: Surface) -> list[View]:
+    """The views of each camera from places apart: pictures of a hover, or copies, show the same
+    ground at the same place of each, as if it were on the lens.
+    """
+    kept, taken = list[View](), set[tuple[str, int, int]]()
+    for view in views:
+        x, y, z = view.pose.map_C
+        step = APART * max(float(z - flat.at(x, y)), 1e-3)
+        name, column, row = alignment.camera_of[view.photo], round(x / step), round(y / step)
+        around_it = ((name, column + i, row + j) for i in (-1, 0, 1) for j in (-1, 0, 1))
+        if taken.isdisjoint(around_it):
+            taken.add((name, column, row))
+            kept.append(view)
+    return kept
 
 
 def _darker(samples: Samples, number: int) -> NDArray[np.float64]:
