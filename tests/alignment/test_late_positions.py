@@ -6,7 +6,7 @@ from datetime import datetime, timedelta
 import numpy as np
 import pytest
 
-from skyquilt.alignment.late_positions import as_moved, on_time, unshifted
+from skyquilt.alignment.late_positions import MIRRORED, as_moved, mirrored, on_time, unshifted
 from skyquilt.alignment.motion import speeds_of
 from tests.alignment.surveys import alignment, photo, prior
 from tests.alignment.test_oblique_start import Slanting
@@ -256,3 +256,66 @@ def test_noise_drift_and_offsets_across_the_flight_belong_to_no_other_moment(see
         )
         is None
     )
+
+
+MIRROR = {
+    "east is taken for west": lambda x, y: (-x, y),
+    "north is taken for south": lambda x, y: (x, -y),
+    # at 50.5 degrees north and 3 west, with both exchanged
+    "latitude and longitude are exchanged": lambda x, y: (y * 0.9986, x / 0.636),
+}
+
+
+def as_mirrored(told, how):
+    """The priors with positions mirrored about a place that is not their middle."""
+    out = []
+    for p in told:
+        x, y, z = p.map_C
+        out.append(replace(p, map_C=np.array([*MIRROR[how](x + 7.0, y - 4.0), z])))
+    return out
+
+
+@pytest.mark.parametrize("how", MIRROR)
+@pytest.mark.parametrize("seed", range(3))
+def test_mirrored_positions_are_mirrored_back(how, seed):
+    """And turned as headings tell; which mirror it is, is told."""
+    told = [replace(p, yaw_deg=10.0) for p in told_at(LINES, 1.5, seed)]
+    found = block(LINES)
+    if how.startswith("latitude"):
+        # the frame is that of the place in the file: 3 degrees south, 50.5 east
+        found = replace(
+            found, frame=replace(found.frame, crs="EPSG:32739", origin=(444500.0, 9668400.0))
+        )
+    back = mirrored(found, as_mirrored(told, how))
+    off = np.array([p.map_C - q.map_C for p, q in zip(back.priors, told, strict=True)])
+    assert np.abs(off - off.mean(0)).max() < 0.2  # shifted only
+    assert how in back.note and MIRRORED in back.note
+    noted = replace(found, notes=(back.note,))
+    cameras, taken = ["A"] * len(LINES), as_mirrored(told, how)
+    again = as_moved(noted, taken, cameras, lambda own, C: np.zeros((len(own), 3)))
+    assert all(np.array_equal(p.map_C, q.map_C) for p, q in zip(again, back.priors, strict=True))
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_positions_that_are_right_or_in_another_order_are_not_mirrored(seed):
+    told = [replace(p, yaw_deg=10.0) for p in told_at(LINES, 8.0, seed)]
+    assert mirrored(block(LINES), told) is None
+    assert mirrored(block(LINES), late_by(told, 3)) is None
+    line = LINES * [1, 0, 1] + [0, 0.3, 0] * (np.arange(len(LINES))[:, None] % 3)
+    assert mirrored(block(line), told_at(line, 3.0, seed)) is None
+    back = [replace(p, map_C=q.map_C) for p, q in zip(told[:18], told[17::-1], strict=True)]
+    assert mirrored(block(LINES[:18]), back) is None
+
+
+@pytest.mark.slow
+def test_a_flight_with_mirrored_positions_has_its_size_and_direction():
+    """Such a map had shrunk to less than a fifth."""
+    flight = Slanting([(x - 45, y - 37, z, 90.0, 0.0) for x, y, z in LINES], seed=1)
+    right = flight.aligned()
+    flight.priors = as_mirrored(flight.priors, "east is taken for west")
+    found = flight.aligned()
+    C, D = (np.array([a.poses[i].map_C for i in sorted(right.poses)]) for a in (right, found))
+    off = (D - D.mean(0)) - (C - C.mean(0))
+    assert np.linalg.norm(off, axis=1).max() < 1.0
+    assert sum(MIRRORED in note for note in found.notes) == 1
+    assert not any(MIRRORED in note for note in right.notes)

@@ -1,5 +1,7 @@
 """Positions that belong to other photos: a logger that is late, photos of the ground before the
-flight that a list of positions counts or leaves out, a line that is missing in it or too many.
+flight that a list of positions counts or leaves out, a line that is missing in it or too many; and
+positions that are mirrored, since latitude and longitude are exchanged or one of them lost its
+sign.
 
 Along a line such positions look right, and where a drone turns they do not; so they bend and shrink
 a map that they hold in place. From a missing line on, all that follow are shifted.
@@ -10,11 +12,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from pyproj import Transformer
 
 from skyquilt.alignment.motion import Speeds
 from skyquilt.alignment.similarity_graph import fit_similarity
-from skyquilt.model.poses import Alignment, Prior
+from skyquilt.geometry.frames import angle_difference_deg, angles_from_cam_R_map
+from skyquilt.model.poses import Alignment, MapFrame, Prior
 
+MIRRORED = "They were mirrored back."
+"""Words of the note by which an alignment tells that positions were mirrored."""
+MIRROR, FEWEST_MIRRORED, ONE_MIRROR = 0.3, 6, 0.6
+"""Positions are mirrored where their mirror image misfits by less than this share of their own
+misfit, of so many photos at least; and of two mirrors one is the right one that misfits by less
+than this share of the other's.
+"""
+LAST_LATITUDE = 85.0
+"""Degrees beyond which nobody flies: what is told for a longitude is then no exchanged latitude."""
+TURNED_DEG = 30.0
+"""Headings tell the mirror where half of them agree with it within this angle."""
 FEWEST, FEWEST_PART = 10, 8
 """Photos of a camera with positions that tell whether these are shifted, and of a part of them."""
 MOST = 6
@@ -74,9 +89,12 @@ def unshifted(found: Alignment, priors: Sequence[Prior], cameras: Sequence[str])
 def as_moved(
     found: Alignment, priors: Sequence[Prior], cameras: Sequence[str], speeds: Speeds
 ) -> Sequence[Prior]:
-    """The priors as an alignment took them: moved where it says so, to other photos or along the
-    flight.
+    """The priors as an alignment took them: mirrored or moved where it says so, to other photos or
+    along the flight.
     """
+    if any(MIRRORED in note for note in found.notes):
+        mirror = mirrored(found, priors)
+        priors = priors if mirror is None else mirror.priors
     told = any(MOVED in note for note in found.notes)
     priors = unshifted(found, priors, cameras) if told else priors
     late = any(LAGGED in note for note in found.notes)
@@ -94,8 +112,8 @@ def moved_note(before: Sequence[Prior], after: Sequence[Prior]) -> str:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Lagged:
-    """Positions moved to the moments of their photos."""
+class Corrected:
+    """Positions that are not as files tell them."""
 
     priors: tuple[Prior, ...]
     """The priors with these positions."""
@@ -103,9 +121,84 @@ class Lagged:
     """What is said of them."""
 
 
+def mirrored(found: Alignment, priors: Sequence[Prior]) -> Corrected | None:
+    """The priors mirrored back about their middle, where their mirror image fits the pictures far
+    better: east for west, north for south, or latitude and longitude exchanged. Headings tell which
+    of the three, where the fit does not. None where positions fit as they are.
+    """
+    own = [i for i in found.held if np.isfinite(priors[i].map_C[:2]).all()]
+    if found.frame.crs is None or len(own) < FEWEST_MIRRORED:
+        return None
+    told = _plane(np.array([priors[i].map_C for i in own]))
+    placed = _plane(np.array([found.poses[i].map_C for i in own]))
+    sigma = np.array([priors[i].sigma_C[0] for i in own])
+    middle = complex(np.median(told.real), np.median(told.imag))
+    wide, high = _exchanged(found.frame, middle)
+
+    def mirror(place: Complex, how: str) -> Complex:
+        x, y = (place - middle).real, (place - middle).imag
+        if how == EXCHANGED:
+            return np.asarray(middle + y * wide + 1j * x * high)
+        return np.asarray(middle + (x - 1j * y if how == SOUTH else -x + 1j * y))
+
+    fits = {how: fit_similarity(placed, mirror(told, how), sigma) for how in MIRRORS}
+    misfit = fit_similarity(placed, told, sigma)[2]
+    best = min(MIRRORS, key=lambda how: fits[how][2])
+    if not fits[best][2] < MIRROR * misfit:
+        return None
+    likely = [how for how in MIRRORS if ONE_MIRROR * fits[how][2] <= fits[best][2]]
+    off = {how: _turned_deg(found, priors, own, fits[how][0]) for how in likely}
+    how = min(likely, key=lambda how: (off[how], MIRRORS.index(how)))
+    headed = any(np.isfinite(priors[i].yaw_deg) for i in own)
+    if headed and not off[how] < TURNED_DEG:  # a list in another order looks mirrored, too
+        return None
+    out = list(priors)
+    for i, prior in enumerate(priors):
+        if np.isfinite(prior.map_C[:2]).all():
+            C = mirror(np.array([complex(*prior.map_C[:2])]), how)[0]
+            out[i] = replace(prior, map_C=np.array([C.real, C.imag, prior.map_C[2]]))
+    return Corrected(
+        priors=tuple(out),
+        note=f"The reported positions are mirrored against the pictures: {how}"
+        f"{'' if headed or len(likely) < 2 else ' or the other way (no photo tells a heading)'}."
+        f" {MIRRORED} So the map has its size and direction, but it lies where files say, on"
+        " another place of the Earth. Correct the positions of the photos, or give right ones in a"
+        " geo.txt. If the place is right, their list has the reverse order, or a program has"
+        " mirrored the pictures, and the map shows them so.",
+    )
+
+
+EXCHANGED = "latitude and longitude are exchanged"
+SOUTH = "north is taken for south, or south for north"
+MIRRORS = "east is taken for west, or west for east", SOUTH, EXCHANGED
+"""What mirrors positions, the usual one first."""
+
+
+def _exchanged(frame: MapFrame, middle: complex) -> tuple[float, float]:
+    """Metres eastwards per metre northwards as told, where latitude and longitude are exchanged,
+    and northwards per metre eastwards.
+    """
+    back = Transformer.from_crs(frame.crs, "EPSG:4326", always_xy=True)
+    lon, lat = back.transform(frame.origin[0] + middle.real, frame.origin[1] + middle.imag)
+    if not (np.isfinite([lon, lat]).all() and abs(lon) < LAST_LATITUDE):
+        return 1.0, 1.0
+    return float(np.cos(np.radians(lon))), float(1 / np.cos(np.radians(lat)))
+
+
+def _turned_deg(found: Alignment, priors: Sequence[Prior], own: Sequence[int], g: complex) -> float:
+    """Median angle in degrees between headings of photos as placed, turned with the block by `g`,
+    and as reported; 180 where none is.
+    """
+    turn = float(np.degrees(np.angle(g)))
+    yaw = [angles_from_cam_R_map(found.poses[i].cam_R_map)[0] - turn for i in own]
+    off = angle_difference_deg(np.array([priors[i].yaw_deg for i in own]), np.array(yaw))
+    known = np.abs(off[np.isfinite(off)])
+    return float(np.median(known)) if len(known) else 180.0
+
+
 def on_time(
     found: Alignment, priors: Sequence[Prior], cameras: Sequence[str], speeds: Speeds
-) -> Lagged | None:
+) -> Corrected | None:
     """The priors with positions moved to the moments at which photos were taken, where those of a
     camera's photos are of another moment, the same time before or after: a receiver that is late, a
     clock that is off. None where none are. `cameras`: that of each photo.
@@ -135,7 +228,7 @@ def on_time(
             f" {'behind' if seconds > 0 else 'ahead of'} them: the pictures show it. {LAGGED} Check"
             " the clock or the receiver that they come from."
         )
-    return Lagged(priors=tuple(out), note=" ".join(said)) if said else None
+    return Corrected(priors=tuple(out), note=" ".join(said)) if said else None
 
 
 def _lag(

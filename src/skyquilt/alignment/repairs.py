@@ -13,7 +13,7 @@ from skyquilt.alignment.determined import STATED_DEG
 from skyquilt.alignment.displaced_parts import as_taken, brought_together
 from skyquilt.alignment.enlarged import enlarged_note, enlarged_photos, fits_better
 from skyquilt.alignment.false_tilts import told_no_tilt
-from skyquilt.alignment.late_positions import as_moved, moved_note, on_time, unshifted
+from skyquilt.alignment.late_positions import as_moved, mirrored, moved_note, on_time, unshifted
 from skyquilt.alignment.motion import Speeds
 from skyquilt.alignment.oblique import reported_oblique, turned_deg, without_photos
 from skyquilt.alignment.oblique_guess import agrees, far_off, lowered, misled
@@ -189,6 +189,14 @@ def _cut_pictures(last: Tried, survey: Survey) -> Tried:
     return _freed(last, survey, cameras, fits_cut, cut_notes, cut=cameras, name="cut ")
 
 
+def _mirrored_positions(last: Tried, survey: Survey) -> Tried:
+    """Positions that are mirrored are mirrored back."""
+    back = mirrored(last.found, last.begun.priors)
+    if back is None:
+        return last
+    return _if_nearer(last, survey, back.priors, "mirrored ", back.note)
+
+
 def _late_positions(last: Tried, survey: Survey) -> Tried:
     """Positions that belong to other photos are moved to these."""
     priors = last.begun.priors
@@ -301,6 +309,7 @@ def priors_taken(
 
 
 REPAIRS: tuple[Callable[[Tried, Survey], Tried], ...] = (
+    _mirrored_positions,
     _as_reported,
     _enlargements,
     _cut_pictures,
