@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from skyquilt.alignment.adjust import covariance
+from skyquilt.alignment.outcome import accuracy
 from skyquilt.alignment.problem import State
 from skyquilt.alignment.same_place import places, shares
 from skyquilt.alignment.stages import weighed
@@ -88,3 +89,19 @@ def test_copies_do_not_make_a_focal_length_sharper(photos):
     (f, sigma), (f1, sigma1) = np.array(told).T, np.array(single).T
     assert (sigma / sigma1 > 0.9).all()
     assert (np.abs(f - f1) < 0.5 * sigma1).all()
+
+
+def test_points_that_only_copies_show_are_not_the_worst_place():
+    """Nothing tells how far away what a photo and its copies alone show is."""
+    block = make_block(1)
+    problem, state = repeated(block, [7], 2)
+    mine = np.isin(problem.photo, [7, 18, 19])
+    lonely = np.unique(problem.point[mine])[::6]
+    kept, points = problem.only(mine | ~np.isin(problem.point, lonely))
+    state = replace(state, X=state.X[points])
+    kept = replace(kept, shared=shares(kept, state, FLYING))
+    setup = SimpleNamespace(stated_sigma_C=np.tile([1.0, 1.0, 2.0], (len(state.C), 1)))
+    told = accuracy(setup, kept, state, covariance(kept, state)).sigma_m.max()
+    single, truth = block.problem, block.truth
+    setup = SimpleNamespace(stated_sigma_C=np.tile([1.0, 1.0, 2.0], (len(truth.C), 1)))
+    assert told < 1.5 * accuracy(setup, single, truth, covariance(single, truth)).sigma_m.max()

@@ -115,10 +115,15 @@ def _ground_part(everything: Problem, state: State, setup: Setup) -> tuple[TiePo
 
 
 def accuracy(setup: Setup, problem: Problem, state: State, covariance: Covariance) -> Accuracy:
-    """Predicted deviations of a sample of ground points; of those that rays tell within the flying
-    height, if there are any: others lie near a horizon, or in photos that nothing holds.
+    """Predicted deviations of a sample of ground points; of those that photos of several places
+    show and rays tell within the flying height, if there are any: others lie near a horizon, or in
+    photos that nothing holds, or between a photo and its copies.
     """
-    seen = np.flatnonzero(np.bincount(problem.point, minlength=len(state.X)) >= 2)
+    counts = np.broadcast_to(problem.shared, problem.point.shape)  # photos of a place as one
+    number = np.bincount(problem.point, counts, minlength=len(state.X))
+    seen = np.flatnonzero(number > 1.5)
+    if not len(seen):
+        seen = np.flatnonzero(np.bincount(problem.point, minlength=len(state.X)) >= 2)
     sample = seen[:: max(1, len(seen) // SAMPLED)]
     sigma = point_deviations(problem, state, covariance, sample)
     told = sigma.max(1, initial=0.0) < float(np.median(heights_above(state)))
