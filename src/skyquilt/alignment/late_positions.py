@@ -63,8 +63,10 @@ across the flight by less than this share of what it lies along it.
 """
 COMPARED = 0.8
 """Share of the positions that are compared, those that fit best."""
-MOVES_MS = 0.5
-"""Slower photos do not tell a moment."""
+MOVES_MS, BARELY_S = 0.5, 0.05
+"""Slower photos do not tell a moment; and so few seconds are none: speeds from times that are
+wrong, as of two halves whose clock was set back in between.
+"""
 
 Complex = NDArray[np.complex128]
 Floats = NDArray[np.float64]
@@ -247,7 +249,7 @@ def _lag(
     likelier = 2 * moves.sum() * np.log(max(before, 1e-9) / max(after, 1e-9))
     if not (after < LESS * before and likelier > LIKELIER):
         return None
-    if abs(late.imag) > ASIDE * abs(late.real):
+    if abs(late.imag) > ASIDE * abs(late.real) or abs(late.real) < BARELY_S:
         return None
     ahead = x[0] * late.real * v
     off = np.abs(told + ahead - x[0] * placed - x[1])
