@@ -259,11 +259,11 @@ def test_noise_drift_and_offsets_across_the_flight_belong_to_no_other_moment(see
 
 
 def test_positions_of_hundredths_of_a_second_before_are_none():
-    """Times that are a hundredth of what passed make such moments of any drift along the lines."""
+    """Times that are a fifth of what passed make such moments of half a metre."""
     photos, time = timed()
     began = photos[0].time
-    fast = [replace(p, time=began + (p.time - began) / 100) for p in photos]
-    told = told_at(of_another_moment(time, 2.0), 0.1, 0)
+    fast = [replace(p, time=began + (p.time - began) / 5) for p in photos]
+    told = told_at(of_another_moment(time, 0.12), 0.02, 0)
     assert on_time(block(LINES), told, ["cam"] * 24, speeds_of(photos)) is not None
     assert on_time(block(LINES), told, ["cam"] * 24, speeds_of(fast)) is None
 
