@@ -145,6 +145,8 @@ def test_the_grid_covers_all_footprints_on_round_coordinates():
 def test_the_photos_own_resolution():
     views = block()
     assert native_gsd(views, FLAT) == pytest.approx(40 / 350.0)
+    high = [view(k, 0, 0, z=80.0) for k in (2, 3)]
+    assert native_gsd([*views[:2], *high], FLAT) == pytest.approx(40 / 350.0)  # of neither: 60
 
 
 def test_boxes_that_meet():

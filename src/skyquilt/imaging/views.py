@@ -128,10 +128,14 @@ def _meet(centre: NDArray[Any], direction: NDArray[Any], surface: Surface) -> ND
 
 
 def native_gsd(views: Sequence[View], surface: Surface) -> float:
-    """Median ground size in m of a photo pixel, at the image centres."""
+    """Median ground size in m of a photo pixel, at the image centres; the finer one of the two in
+    the middle where these differ: half of the photos are of another camera, or flew higher.
+    """
     C = np.array([v.pose.map_C for v in views])
     drop = C[:, 2] - surface.at(C[:, 0], C[:, 1])
-    return float(np.median(drop / np.array([v.camera.focal for v in views])))
+    size = drop / np.array([v.camera.focal for v in views])
+    middle, finer = float(np.median(size)), float(np.quantile(size, 0.5, method="lower"))
+    return middle if middle < 1.2 * finer else finer  # their mean is the size of neither
 
 
 def grid_of(
