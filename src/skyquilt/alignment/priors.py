@@ -10,10 +10,12 @@ from pyproj.exceptions import CRSError
 from skyquilt.alignment.heights import chosen_datum, control_datum, height_above
 from skyquilt.errors import UsageError
 from skyquilt.geometry.frames import angle_difference_deg
-from skyquilt.model.photo import ControlPoint, Photo
+from skyquilt.model.photo import ControlPoint, Datum, Photo
 from skyquilt.model.poses import MapFrame, Prior
 from skyquilt.outside import plain
 
+SIGMA_HEIGHT_M = 3.0
+"""Deviation in m of the height above take-off of a photo without a position."""
 STRETCH_STEP_M = 50.0
 """Way in m over which a coordinate system's scale is measured."""
 STRETCH_TOLD, STRETCH_REFUSED = 0.005, 0.1
@@ -57,13 +59,14 @@ def choose_frame(
         places = list(zip(lat, lon, strict=True))
     name = checked_crs(crs) if crs else ""
     if not places:
-        metric = any(p.position and p.position.takeoff_m for p in photos)
+        metric = any(p.height_m is not None for p in photos)
         if vertical_datum is not None:
             raise UsageError(
                 f"--vertical-datum {vertical_datum} needs positions, and the photos have none; give"
                 " them with --geo"
             )
-        return MapFrame(crs=None, origin=(0.0, 0.0), vertical_datum="unknown", metric=metric)
+        datum: Datum = "takeoff" if metric else "unknown"
+        return MapFrame(crs=None, origin=(0.0, 0.0), vertical_datum=datum, metric=metric)
     latitude, longitude = _middle(np.array(places))
     name = name or utm_epsg(latitude, longitude)
     x, y = Transformer.from_crs(4326, name, always_xy=True).transform(longitude, latitude)
@@ -199,6 +202,10 @@ def photo_prior(photo: Photo, frame: MapFrame, to_map: Transformer | None) -> Pr
     if photo.position:
         C[2] = height_above(photo.position, frame.vertical_datum, frame.takeoff_m)
         sigma[2] = photo.position.sigma_z_m
+    elif photo.height_m is not None:
+        zero = 0.0 if frame.vertical_datum == "takeoff" else frame.takeoff_m
+        C[2] = np.nan if zero is None else photo.height_m + zero
+        sigma[2] = SIGMA_HEIGHT_M if zero is not None else np.inf
     attitude = photo.attitude
     yaw = attitude.yaw_deg if attitude else photo.flight_yaw_deg
     return Prior(

@@ -192,6 +192,10 @@ class Photo:
     """Always present; a guess with a large standard deviation where nothing is known."""
     position: GeoPosition | None
     """None where the photo has none or it is invalid, e.g. (0, 0); then a note reports it."""
+    height_m: float | None = None
+    """Height above take-off in m of a photo without a position; None where the position tells it,
+    or nothing does.
+    """
     attitude: Attitude | None
     """The camera's attitude as reported."""
     flight_yaw_deg: float | None = None

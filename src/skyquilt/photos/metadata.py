@@ -66,6 +66,11 @@ def read_position(exif: Exif, xmp: Xmp) -> tuple[GeoPosition | None, tuple[str, 
     return position, tuple(notes)
 
 
+def read_height(exif: Exif, xmp: Xmp) -> float | None:
+    """Height above take-off in m, which files may tell without a position; None where not."""
+    return _heights(exif, xmp, [])[0]
+
+
 def why_void(latitude: float | None, longitude: float | None) -> str:
     """Why a pair of degrees is not a position; empty when it is one."""
     if latitude is None or longitude is None:

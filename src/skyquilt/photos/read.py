@@ -33,6 +33,7 @@ from skyquilt.photos.metadata import (
     read_attitude,
     read_flight_tilt,
     read_flight_yaw,
+    read_height,
     read_position,
     read_time,
     read_velocity,
@@ -214,6 +215,7 @@ def _photo(path: Path, name: str, header: Header, thermal_unit: str | None) -> P
         unusable_calibration=" and ".join(lens.nonsense),
         focal=lens.focal,
         position=position,
+        height_m=None if position else _height(header),
         attitude=attitude,
         flight_yaw_deg=flight_yaw,
         flight_tilt_deg=read_flight_tilt(header.xmp),
@@ -226,6 +228,11 @@ def _photo(path: Path, name: str, header: Header, thermal_unit: str | None) -> P
         coding="" if header.jpeg is None else header.jpeg.coding,
         notes=tuple(n for n in (*_broken_notes(header), *strange, *seen, *more) if n),
     )
+
+
+def _height(header: Header) -> float | None:
+    """Height above take-off in m of a file without a position."""
+    return _ignoring(lambda: read_height(header.exif, header.xmp), lambda: None, "height", [])
 
 
 def _ignoring(read: Callable[[], T], otherwise: Callable[[], T], what: str, notes: list[str]) -> T:

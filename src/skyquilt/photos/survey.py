@@ -335,7 +335,11 @@ def _gaps(photos: Sequence[Photo]) -> Iterator[str]:
             else f"{len(void)} of {len(photos)} photos lack"
         )
         yield f"{which} a usable GPS position" + (
-            f": {sentence_of(void)}." if len(void) < len(photos) else "."
+            f": {sentence_of(void)}."
+            if len(void) < len(photos)
+            else "; heights above take-off tell the scale of the map."
+            if any(p.height_m is not None for p in photos)
+            else "."
         )
     stated = {p.name: n for p in photos if p.position is None for n in p.notes if INVALID in n}
     if stated:
