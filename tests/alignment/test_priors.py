@@ -189,3 +189,23 @@ def test_the_flight_s_heading_stands_in_for_the_camera_s():
     (prior,) = priors([plain], frame)
     assert prior.yaw_deg == pytest.approx(90.0 - frame.convergence_deg)
     assert prior.yaw_source == "xmp-flight" and prior.sigma_yaw_deg == 15.0
+
+
+def test_heights_without_positions_tell_the_scale():
+    """Where no photo has a position they are the map's heights; where others have, they are
+    converted as theirs are, or unknown.
+    """
+    bare = [photo(position=None, height_m=h) for h in (58.0, 61.0)]
+    frame = choose_frame([*bare, photo(position=None)], None)
+    assert (frame.crs, frame.vertical_datum, frame.metric) == (None, "takeoff", True)
+    told = priors([*bare, photo(position=None)], frame)
+    assert [p.map_C[2] for p in told[:2]] == [58.0, 61.0]
+    assert np.isnan(told[0].map_C[:2]).all() and np.isnan(told[2].map_C[2])
+    for others, height in (
+        (at(50.8, -0.14), 58.0),
+        (at(50.8, -0.14, altitude_m=160.0, datum="sea_level", sea_level_m=160.0), np.nan),
+    ):
+        mixed = [others, bare[0]]
+        (_, prior) = priors(mixed, choose_frame(mixed, None))
+        assert prior.map_C[2] == pytest.approx(height, nan_ok=True)
+    assert not choose_frame([photo(position=None)], None).metric

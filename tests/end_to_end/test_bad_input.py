@@ -2,6 +2,7 @@
 lost.
 """
 
+import json
 import os
 import shutil
 from pathlib import Path
@@ -354,14 +355,17 @@ def test_two_photos_without_overlap_or_positions(mosaic, photos):
 
 
 @pytest.mark.slow
-def test_gps_zero_zero_of_all(mosaic, photos):
+def test_gps_zero_zero_of_all(mosaic, photos, finished):
+    """Heights above take-off tell the scale, to 4 % where the ground is as uneven as here."""
     for path in named(photos):
         relabel(path, place=(0.0, 0.0))
     told = mosaic(photos).made()
     assert told.metrics["crs"] is None
     assert told.metrics["photos_used"] == 9
     assert told.metrics["gps_residual_rms_m"] is None
-    assert "GPS" in told.notes
+    assert "GPS" in told.notes and "tell the scale" in told.notes
+    native = json.loads((finished / "metrics.json").read_text())["native_gsd_m"]
+    assert told.metrics["native_gsd_m"] == pytest.approx(native, rel=0.04)
 
 
 @pytest.mark.slow

@@ -100,6 +100,15 @@ def test_void_positions_are_none_with_a_note(make_jpeg, gps, words):
     assert any(words in note for note in photo.notes), photo.notes
 
 
+def test_a_height_above_take_off_stays_without_a_position(make_jpeg):
+    exif = dji_exif()
+    exif["GPS"] = {}
+    photo = read_photo(make_jpeg(exif=exif, xmp=dji_xmp(RelativeAltitude="+39.80")))
+    assert (photo.position, photo.height_m) == (None, 39.8)
+    placed = read_photo(make_jpeg(exif=dji_exif(), xmp=dji_xmp(RelativeAltitude="+39.80")))
+    assert (placed.position.takeoff_m, placed.height_m) == (39.8, None)
+
+
 def test_void_xmp_position_falls_back_to_exif(make_jpeg):
     photo = read_photo(
         make_jpeg(exif=dji_exif(), xmp=dji_xmp(GpsLatitude="0.0", GpsLongitude="0.0"))
