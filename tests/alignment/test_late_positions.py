@@ -306,6 +306,18 @@ def test_mirrored_positions_are_mirrored_back(how, seed):
     assert all(np.array_equal(p.map_C, q.map_C) for p, q in zip(again, back.priors, strict=True))
 
 
+def test_positions_that_headings_say_are_not_mirrored_have_another_reason():
+    """As of pictures that a program mirrored: headings lie 50 degrees off in each of three ways."""
+    told = as_mirrored(
+        [replace(p, yaw_deg=60.0) for p in told_at(LINES, 1.5, 0)], "east is taken for west"
+    )
+    back = mirrored(block(LINES), told)
+    assert "a program has mirrored the pictures. " in back.note and "east" not in back.note
+    assert (
+        "no photo tells" in mirrored(block(LINES), [replace(p, yaw_deg=np.nan) for p in told]).note
+    )
+
+
 @pytest.mark.parametrize("seed", range(10))
 def test_positions_that_are_right_or_in_another_order_are_not_mirrored(seed):
     told = [replace(p, yaw_deg=10.0) for p in told_at(LINES, 8.0, seed)]

@@ -126,7 +126,8 @@ class Corrected:
 def mirrored(found: Alignment, priors: Sequence[Prior]) -> Corrected | None:
     """The priors mirrored back about their middle, where their mirror image fits the pictures far
     better: east for west, north for south, or latitude and longitude exchanged. Headings tell which
-    of the three, where the fit does not. None where positions fit as they are.
+    of the three, where the fit does not; where they agree with none, pictures may be mirrored.
+    None where positions fit as they are.
     """
     own = [i for i in found.held if np.isfinite(priors[i].map_C[:2]).all()]
     if found.frame.crs is None or len(own) < FEWEST_MIRRORED:
@@ -152,8 +153,10 @@ def mirrored(found: Alignment, priors: Sequence[Prior]) -> Corrected | None:
     off = {how: _turned_deg(found, priors, own, fits[how][0]) for how in likely}
     how = min(likely, key=lambda how: (off[how], MIRRORS.index(how)))
     headed = any(np.isfinite(priors[i].yaw_deg) for i in own)
-    if headed and not off[how] < TURNED_DEG:  # a list in another order looks mirrored, too
-        return None
+    if headed and not off[how] < TURNED_DEG:
+        why = "their list has another order, or a program has mirrored the pictures"
+    else:
+        why = how if headed or len(likely) < 2 else f"{how} or the other way ({UNHEADED})"
     out = list(priors)
     for i, prior in enumerate(priors):
         if np.isfinite(prior.map_C[:2]).all():
@@ -161,17 +164,17 @@ def mirrored(found: Alignment, priors: Sequence[Prior]) -> Corrected | None:
             out[i] = replace(prior, map_C=np.array([C.real, C.imag, prior.map_C[2]]))
     return Corrected(
         priors=tuple(out),
-        note=f"The reported positions are mirrored against the pictures: {how}"
-        f"{'' if headed or len(likely) < 2 else ' or the other way (no photo tells a heading)'}."
-        f" {MIRRORED} So the map has its size and direction, but it lies where files say, on"
-        " another place of the Earth. Correct the positions of the photos, or give right ones in a"
-        " geo.txt. If the place is right, their list has the reverse order, or a program has"
-        " mirrored the pictures, and the map shows them so.",
+        note=f"The reported positions are mirrored against the pictures: {why}. {MIRRORED} So the"
+        " map has its size and direction, but it lies where files say, on another place of the"
+        " Earth. Correct the positions of the photos, or give right ones in a geo.txt. If the place"
+        " is right, their list has the reverse order, or a program has mirrored the pictures, and"
+        " the map shows them so.",
     )
 
 
 EXCHANGED = "latitude and longitude are exchanged"
 SOUTH = "north is taken for south, or south for north"
+UNHEADED = "no photo tells a heading"
 MIRRORS = "east is taken for west, or west for east", SOUTH, EXCHANGED
 """What mirrors positions, the usual one first."""
 
