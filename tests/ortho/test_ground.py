@@ -8,6 +8,7 @@ import pytest
 from skyquilt.engine.clock import result_of
 from skyquilt.engine.store import Store
 from skyquilt.geometry.frames import cam_R_map_from_angles
+from skyquilt.imaging.blank import whole_picture
 from skyquilt.model.poses import Pose, no_ties
 from skyquilt.model.raster import Grid
 from skyquilt.ortho.ground import ALIGNED, find_ground
@@ -68,6 +69,27 @@ def test_the_grid_covers_all_that_photos_show_on_the_heights_found(alignment, lo
     margin = ground.grid.gsd
     assert (shown.min(0) > [west - margin, south - margin]).all()
     assert (shown.max(0) < [east + margin, north + margin]).all()
+
+
+def test_photos_that_yield_to_finer_ones_do_not_tell_the_pixel(alignment, tmp_path):
+    """Of two photos at 40 m and four at 80 m that yield to these; without marks, four are more."""
+    high = {
+        k: replace(alignment.poses[k % 2], map_C=np.array([0.0, 5.0 * k, 2 * HEIGHT_M]))
+        for k in range(2, 6)
+    }
+    alignment = placed({**alignment.poses, **high}, alignment.ties)
+    coarse = dict.fromkeys(high, whole_picture((CAMERA.width, CAMERA.height)))
+    for marks, height in ((coarse, HEIGHT_M), ({}, 2 * HEIGHT_M)):
+        steps = find_ground(
+            alignment,
+            lambda photo, side: np.full((30, 40), 100, np.uint8),
+            FromTiePoints(),
+            None,
+            PictureSettings(),
+            Store(folder=tmp_path, registry=REGISTRY),
+            marks=marks,
+        )
+        assert result_of(steps).native_gsd == pytest.approx(height / CAMERA.focal)
 
 
 def test_a_grid_reaches_as_far_as_another_one_and_its_cells_stay():
