@@ -29,8 +29,10 @@ from pathlib import Path
 import numpy as np
 from live_viewers import Browser
 
+from skyquilt.engine.clock import result_of
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.store import Store
+from skyquilt.engine.workers import HERE
 from skyquilt.imaging.views import grid_of, make_views, native_gsd
 from skyquilt.live.live_map import LiveMap
 from skyquilt.live.settings import LiveSettings
@@ -228,10 +230,12 @@ def seams(survey: Path, gsd: float) -> None:
         settings = MosaicSettings(balance=False)
         methods = methods_for(settings)
         compose = orthomosaic.composer(3, "uint8", ground, NEUTRAL, None, methods.blend, cache)
-        steps = orthomosaic.draw(
-            home, compose, alignment, settings.output, None, store, "live", photos[0].unit, 2
-        )
-        of_live = measure_seams(compose, drain(steps), ground).figures
+        drawing = orthomosaic.Drawing(
+            output=home, compose=compose, alignment=alignment, settings=settings.output,
+            boundary=None, unit=photos[0].unit, store=store, key="live",
+        )  # fmt: skip
+        result_of(drawing.blocks(HERE))
+        of_live = measure_seams(compose, drawing.companions(), ground).figures
     of_batch = mosaic(survey, home / "batch").metrics["seam_disparity_px"]
     print("live: ", of_live)
     print("batch:", of_batch)
@@ -257,14 +261,6 @@ def tone(survey: Path, gsd: float) -> None:
     for what, found in (("live", of_live), ("batch", of_batch), ("not balanced", of_none)):
         print(f"{what:13} {found}")
     print(f"live over batch: {of_live['median'] / of_batch['median']:.2f}")
-
-
-def drain(steps):
-    try:
-        while True:
-            next(steps)
-    except StopIteration as stop:
-        return stop.value
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Photos that an adjustment of their block cannot hold."""
+"""Results of adjustments of whole blocks: photos that they cannot hold, and their warnings."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -8,6 +8,7 @@ import pytest
 
 from skyquilt.alignment.local_adjustment import AdjustedWindow
 from skyquilt.geometry.frames import rotation_from_vector
+from skyquilt.live.apply_adjustment import TOLD
 from skyquilt.live.background_adjustment import BlockAdjustment
 from skyquilt.live.live_map import LiveMap
 from skyquilt.live.settings import LiveSettings
@@ -127,3 +128,24 @@ def test_a_photo_does_not_turn_its_neighbours_over(live, monkeypatch, step_m, de
     good = {(i, 4): local.live_links.link(i, 4) for i in (1, 2, 3)}
     change = local._adjusted_locally(members.by_id[4], dict(good), good)
     assert asked[-1] == held and len(change.moved) == 4 - held
+
+
+@pytest.mark.parametrize(("photos", "times"), [(10, 1), (9, 0)])
+def test_warnings_of_whole_adjustments_are_told_once(live, photos, times):
+    members, apply = live.members, live.apply_adjustment
+    poses = {i: m.pose for i, m in members.by_id.items()}
+    number = live.ledger.row("select coalesce(max(seq), 0) from event")[0]
+    live.ledger.put_meta(TOLD, [])
+    for metres, names in ((15, "a.jpg, b.jpg"), (17.5, "c.jpg")):
+        done = BlockAdjustment(
+            ids=tuple(range(1, photos + 1)),
+            poses=poses,
+            cameras={},
+            camera_of={},
+            xyz=np.zeros((0, 3)),
+            notes=(f"Positions lie {metres} m off ({names}).",),
+        )
+        apply.apply(done)
+    said = [body for _, kind, body in live.ledger.told(number) if kind == "note"]
+    assert sum("So far: Positions lie 15 m off (a.jpg, b.jpg)." in body for body in said) == times
+    assert sum("Positions lie" in body for body in said) == times

@@ -18,6 +18,13 @@ OUTDATED = 0.5
 OUTGROWN = 2.0
 """A result tells less than its photos do now where their block has so many times as many."""
 
+FEWEST_TOLD, TOLD = 10, "adjustments told"
+"""Photos of a block from which the warnings of its adjustments are told, as those of fewer soon
+change; and the name in the ledger of what was told.
+"""
+VALUES = r"[0-9][0-9.]*(e\+?[0-9]+)?|\([^()]*\)"
+"""What differs between warnings that are the same: figures, names of photos."""
+
 
 class ApplyAdjustment:
     """Stores the new poses of a block. Photos that were placed during the job move with their
@@ -58,6 +65,8 @@ class ApplyAdjustment:
                 self._follow(member, steps)
             self.schedule.write(self.ledger)
             self.ledger.tell("note", {"text": text})
+            if len(done.ids) >= FEWEST_TOLD:
+                self.ledger.tell_new(done.notes, TOLD, VALUES)
         hit("block closed")
         if done.cameras:  # heights and calibrations changed: redraw the whole block
             self._show(done)

@@ -91,6 +91,8 @@ class BlockAdjustment:
     """(P, 3) ground points in m."""
     rejected: dict[int, str] = field(default_factory=dict)
     """Photos that could not be held, with reasons."""
+    notes: tuple[str, ...] = ()
+    """What users of a map of these photos must know; empty if only part of a block was adjusted."""
     before: dict[int, Pose] = field(default_factory=dict)
     """Poses when the job began."""
     problem: str = ""
@@ -160,6 +162,7 @@ def _whole(
         camera_of={job.ids[k]: done.camera_of[k] for k in done.poses},
         xyz=xyz,
         rejected={job.ids[k]: why for k, why in done.rejected.items()},
+        notes=done.notes,
     )
 
 

@@ -15,7 +15,7 @@ import re
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -222,6 +222,19 @@ class Ledger:
                 "insert into event(at, kind, body) values (?, ?, ?)",
                 (time.time(), kind, json.dumps(body)),
             )
+
+    def tell_new(self, notes: Iterable[str], key: str, values: str) -> None:
+        """Appends notes for viewers that were not told before, but for other values (inside a
+        transaction). `key`: under which what was told is remembered; `values`: a regular expression
+        for what differs where a note is the same.
+        """
+        said = self.meta(key)
+        told = {str(text) for text in said} if isinstance(said, list) else set[str]()
+        for note in notes:
+            if (kind := re.sub(values, "", note)) not in told:
+                told.add(kind)
+                self.tell("note", {"text": f"So far: {note}"})
+        self.put_meta(key, sorted(told))
 
     def told(self, after: int, limit: int = 500) -> list[tuple[int, str, str]]:
         """(number, kind, JSON) of events after a number."""

@@ -4,8 +4,6 @@ The same sentences as of whole flights, but none twice for other numbers alone. 
 whenever the photos have grown by a fifth: that costs more the more there are.
 """
 
-import re
-
 from skyquilt.live.doubled import MOST_NOTED
 from skyquilt.live.links import LiveLinks
 from skyquilt.live.members import Member
@@ -17,6 +15,8 @@ from skyquilt.photos.thermal_units import unit_notes
 
 NOTED, TOLD = "thermal noted", "thermal told"
 """Names in the ledger of the number of thermal photos at the last look, and of what was told."""
+VALUES = r"[0-9]+|as [^ ]+ \(|, as .*?:"
+"""What differs between notes that are the same."""
 FEWEST, GROWN = 2, 1.2
 """Photos from which these are looked for, and the growth after which they are again."""
 LOOKED_AT = 24
@@ -45,14 +45,8 @@ class ThermalNotes:
         if len(known) < max(FEWEST, GROWN * noted):
             return
         ledger.put_meta(NOTED, len(known))
-        said = ledger.meta(TOLD)
-        told = {str(text) for text in said} if isinstance(said, list) else set[str]()
-        for note in (*unit_notes([m.photo for m in known]), *self._palettes(known)):
-            kind = re.sub(r"[0-9]+|as [^ ]+ \(|, as .*?:", "", note)
-            if kind not in told:
-                told.add(kind)
-                ledger.tell("note", {"text": f"So far: {note}"})
-        ledger.put_meta(TOLD, sorted(told))
+        notes = (*unit_notes([m.photo for m in known]), *self._palettes(known))
+        ledger.tell_new(notes, TOLD, VALUES)
 
     def _palettes(self, known: list[Member]) -> tuple[str, ...]:
         own = [m for m in known if m.photo.band == "thermal" and not m.photo.unit]
