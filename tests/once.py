@@ -8,6 +8,7 @@ import functools
 import hashlib
 import os
 import pickle
+import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -42,9 +43,14 @@ def once_for_all(
 
 
 def flown_once(temporary: pytest.TempPathFactory, name: str, settings: FlightSettings) -> Path:
-    """Folder of a simulated flight, for all processes."""
+    """Folder of a simulated flight, for all processes. Those of one name and other settings are not
+    one.
+    """
+    mark = zlib.crc32(repr(settings).encode())
     return once_for_all(
-        temporary, name, lambda folder: list(simulate(settings, folder, overwrite=True))
+        temporary,
+        f"{name}-{mark:08x}",
+        lambda folder: list(simulate(settings, folder, overwrite=True)),
     )
 
 
