@@ -189,7 +189,12 @@ def turned_deg(pose: Pose, prior: Prior) -> float:
     if not tells_angles(prior):
         return 0.0
     reported = cam_R_map_from_angles(prior.yaw_deg, prior.pitch_deg, prior.roll_deg)
-    return float(np.degrees(np.arccos(np.clip(pose.cam_R_map[2] @ reported[2], -1, 1))))
+    return axes_apart_deg(pose.cam_R_map, reported)
+
+
+def axes_apart_deg(a: Array, b: Array) -> float:
+    """Angle in degrees between where cameras of two attitudes (3, 3, map to camera) look."""
+    return float(np.degrees(np.arccos(np.clip(a[2] @ b[2], -1, 1))))
 
 
 def _points_of(

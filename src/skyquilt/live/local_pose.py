@@ -11,6 +11,7 @@ from skyquilt.alignment.aligners import ONE_TONE
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.determined import AGAINST, elsewhere_reason, lies_elsewhere
 from skyquilt.alignment.local_adjustment import AdjustedWindow, LocalAdjustment, Window
+from skyquilt.alignment.oblique import axes_apart_deg
 from skyquilt.errors import AlignmentError, UnreadablePhotoError
 from skyquilt.live.drone_metadata import Metadata
 from skyquilt.live.kept_frame import in_frame_of
@@ -261,8 +262,8 @@ class LocalPose:
                 continue
             high = max(float(stood.map_C[2]) - self.metadata.ground_at(stood.map_C), 1.0)
             away = float(np.linalg.norm(pose.map_C - stood.map_C))
-            cosine = float(np.clip(pose.cam_R_map[2] @ stood.cam_R_map[2], -1, 1))
-            if away > STRAY_HIGH * high or np.degrees(np.arccos(cosine)) > STRAY_DEG:
+            turned = axes_apart_deg(pose.cam_R_map, stood.cam_R_map)
+            if away > STRAY_HIGH * high or turned > STRAY_DEG:
                 return True
         return False
 

@@ -8,7 +8,7 @@ from skyquilt.engine.clock import Steps
 from skyquilt.engine.folder import refusal
 from skyquilt.engine.store import Store, digest
 from skyquilt.errors import NoPhotosError, UnreadablePhotoError
-from skyquilt.model.clip import ChosenFrames, Clip, Looks
+from skyquilt.model.clip import ChosenFrames, Clip, Looks, Track
 from skyquilt.model.event import Note
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.photos.clips import after_others, frames_of
@@ -197,10 +197,8 @@ def timed(
                     " another clip or is torn, and was not used. --clock-offset 0 uses it anyway."
                 ],
             )
-        late = float(track.height_time_s[0])
-        beyond = float(track.height_time_s[-1]) - lasts
-        row = told / max(len(track.height_time_s) - 1, 1)
-        if min(late, beyond) > _SPAN_S and abs(late - beyond) < _SPAN_S + row:
+        late = _late_as_a_whole(track, lasts)
+        if late:
             begun = (
                 f"{track.file} lasts as long as the clip, but begins at {late:.1f} s. It is taken"
                 " to begin with the clip. --clock-offset 0 takes its times as they are."
@@ -217,6 +215,17 @@ def timed(
             ],
         )
     return replace(chosen, offset_source="clock"), True, []
+
+
+def _late_as_a_whole(track: Track, lasts: float) -> float:
+    """Seconds by which positions begin after a clip that lasts as long; 0 where they do not begin
+    and end after it by the same time.
+    """
+    time = track.height_time_s
+    late, beyond = float(time[0]), float(time[-1]) - lasts
+    row = float(time[-1] - time[0]) / max(len(time) - 1, 1)
+    alike = min(late, beyond) > _SPAN_S and abs(late - beyond) < _SPAN_S + row
+    return late if alike else 0.0
 
 
 def _contradicts(found: Offset | None) -> bool:
