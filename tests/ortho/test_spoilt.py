@@ -10,7 +10,7 @@ import rasterio
 from PIL import Image
 
 from skyquilt.imaging.blank import around, joined
-from skyquilt.imaging.views import make_views
+from skyquilt.imaging.views import make_views, native_gsd
 from skyquilt.ortho.spoilt import coarser_parts, spoilt_parts
 from skyquilt.ortho.tie_surface import level
 from skyquilt.settings import MosaicSettings
@@ -204,7 +204,10 @@ def test_photos_yield_where_others_are_much_finer(odd, factor):
     the ground, and they to none.
     """
     alignment = of_two_cameras(flight(10, apart=9.0), odd, factor)
-    marks, notes = coarser_parts(alignment, make_views(alignment, level(0.0)), "abcdefghij")
+    views = make_views(alignment, level(0.0))
+    fine = native_gsd(views[::2], level(0.0))
+    assert coarser_parts(alignment, views, "abcdefghij", 1.3 * fine) == ({}, ())  # on such a map
+    marks, notes = coarser_parts(alignment, views, "abcdefghij", 1.1 * fine)
     assert sorted(marks) == [1, 3, 5, 7, 9]
     yields = marks[5].at(np.full(3, 200 / factor), np.array([10.0, 150.0, 290.0]) / factor) < 0
     assert yields[1] and (odd == 0 or not (yields[0] or yields[2]))  # higher up, it sees more

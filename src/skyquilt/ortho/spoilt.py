@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from skyquilt.imaging.blank import Blank, around, joined
 from skyquilt.imaging.nodes import View, project_all
-from skyquilt.imaging.views import make_views, on_ground
+from skyquilt.imaging.views import make_views, native_gsd, on_ground
 from skyquilt.model.poses import Alignment
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.exposure import Balance, Samples
@@ -69,10 +69,11 @@ def spoilt_parts(
     thumbnails: Mapping[int, NDArray[Any]],
     names: Sequence[str],
     fixed: Mapping[int, Blank],
+    gsd_cm: float | None = None,
 ) -> tuple[dict[int, Blank], tuple[str, ...]]:
     """What yields to other photos, by photo (index), only of photos where something does, and
     notes. `details` as in `find_blurred`, `thumbnails` (h, w[, bands]), `names` of the photos,
-    `fixed`: where they show marks.
+    `fixed`: where they show marks, `gsd_cm`: ground size of a map pixel, None: that of the photos.
     """
     blurred, notes = find_blurred(alignment, details, names)
     white, of_8_bits = dict[int, Blank](), set[int]()
@@ -95,7 +96,8 @@ def spoilt_parts(
     veiled = veiled_parts(views, xyz, thumbnails, fixed, spoilt=pale) if len(xyz) else {}
     if unnamed := sorted(veiled.keys() - pale):
         notes += (veiled_note([names[i] for i in unnamed]),)
-    coarse, told = coarser_parts(alignment, placed, names)
+    gsd = gsd_cm / 100 if gsd_cm else native_gsd(placed, flat) if placed else 0.0
+    coarse, told = coarser_parts(alignment, placed, names, gsd)
     notes += told
     out = dict(fixed)
     for found in (blurred, white, spots, veiled, coarse):
@@ -104,10 +106,11 @@ def spoilt_parts(
 
 
 def coarser_parts(
-    alignment: Alignment, views: Sequence[View], names: Sequence[str]
+    alignment: Alignment, views: Sequence[View], names: Sequence[str], gsd: float = 0.0
 ) -> tuple[dict[int, Blank], tuple[str, ...]]:
     """Where photos show ground that others, linked by tie points, show much finer, by photo
-    (index), and a note. `names` of the photos.
+    (index), and a note. `names` of the photos. No photo counts as finer than a pixel of the map,
+    `gsd` in m: the map does not show what it shows besides.
 
     Photos are compared at the ground below each, as wide as a pixel is there, and those that show
     it finer by the longer side of a pixel: on a slope, photos farther up are nearer to the ground
@@ -132,7 +135,7 @@ def coarser_parts(
         above = high - ground[k]
         finer = linked & (above > 0) & (MUCH_FINER * above < size * focal)
         finer &= ((low < up[k]) & (up > low[k])).all(1)
-        if not size > 0 or not finer.any():
+        if not size > MUCH_FINER * gsd or not finer.any():
             continue
         others = [views[j] for j in np.flatnonzero(finer).tolist()]
         mask, factor = _finer_shown(view, size, others, ground[k])

@@ -245,10 +245,10 @@ def find_ground(
         earlier = aligned.earlier.map_of(aligned.photos, clock.store, output)
 
     def steps() -> Steps[Ground]:
-        alignment, looks = aligned.alignment, aligned.found
+        alignment, looks, gsd_cm = aligned.alignment, aligned.found, settings.picture.gsd_cm
         fixed = aligned.links.marks.shown([p.camera_key for p in looks.photos])
         small, names = looks.thumbnails(sorted(alignment.poses)), [p.name for p in looks.photos]
-        marks, notes = spoilt_parts(alignment, looks.detail, small, names, fixed)
+        marks, notes = spoilt_parts(alignment, looks.detail, small, names, fixed, gsd_cm)
         found = yield from ground.find_ground(
             alignment,
             aligned.grey,
