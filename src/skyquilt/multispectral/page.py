@@ -23,7 +23,7 @@ LONGEST = 1000
 """Longer side in px of pictures in the page."""
 _VALUES = {
     "reflectance": "Values are reflectances, 0 to 1, by the camera's calibration and its sun"
-    " sensor.",
+    " sensor, or a panel.",
     "relative": "Values are proportional to reflectance, with one factor for all bands, by the"
     " camera's calibration and its sun sensor.",
     "by-band": "Values are proportional to reflectance, with a factor of each band's own that files"
@@ -55,6 +55,7 @@ def band_figures(
         "photos_rejected": {p.name: p.reason for p in lost},
         "notes": [
             *placed.notes[len(placed.refused) :],
+            *([placed.panel.text] if placed.panel else []),
             *sorted({n for b in bands for c in b.files.converts for n in c.notes}),
         ],
     }

@@ -16,6 +16,7 @@ from skyquilt.imaging.grey import shrink, to_grey8
 from skyquilt.imaging.nodes import View
 from skyquilt.imaging.views import on_ground
 from skyquilt.model.camera import Camera
+from skyquilt.model.event import Note
 from skyquilt.model.photo import Photo, RejectedPhoto, evenly
 from skyquilt.model.registration import RefusedRegistration
 from skyquilt.multispectral.beside import Together
@@ -28,6 +29,7 @@ from skyquilt.multispectral.captures import (
 )
 from skyquilt.multispectral.draw import PlacedBand
 from skyquilt.multispectral.focus import relative_detail, typical, unsharp_notes
+from skyquilt.multispectral.panels import by_panels
 from skyquilt.multispectral.recorded import Recorded, look_at
 from skyquilt.multispectral.reflectance import KINDS, Kind, common_kind
 from skyquilt.multispectral.rig import BandRig, FindBandRig
@@ -65,7 +67,9 @@ class Placing:
     final: bool
     """Whether another run of the same files would leave out the same."""
     notes: list[str]
-    """What the user is told."""
+    """What the user is warned of."""
+    panel: Note | None
+    """How pictures of a panel are used, or why not."""
 
 
 def place_bands(scene: Scene, others: Sequence[Photo], workers: Workers) -> Steps[Placing]:
@@ -108,6 +112,8 @@ def place_bands(scene: Scene, others: Sequence[Photo], workers: Workers) -> Step
         for b in placed
     ]
     placed.sort(key=lambda b: b.files.order)
+    away = [p for i, p in enumerate(aligned.photos) if i not in poses and p.shows_a_band]
+    placed, panel = by_panels(placed, [*own, *bands_of_files(away), *found])
     bands, kind, weaker = _comparable(placed)
     notes = [f"The band {name} is left out: {reason}." for name, reason in refused.items()]
     notes += [note for b in placed for note in _notes(b)]
@@ -119,6 +125,7 @@ def place_bands(scene: Scene, others: Sequence[Photo], workers: Workers) -> Step
         lost=lost,
         final=not any(r.gone for r in recorded.values()),
         notes=notes,
+        panel=panel,
     )
 
 

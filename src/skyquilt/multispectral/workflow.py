@@ -24,6 +24,7 @@ from skyquilt.multispectral.composite import INFRARED_FILE, write_infrared
 from skyquilt.multispectral.draw import BANDS_FILE, BandsDrawing, PlacedBand
 from skyquilt.multispectral.indices import indices_of
 from skyquilt.multispectral.page import band_figures, write_section
+from skyquilt.multispectral.panels import by_panels
 from skyquilt.multispectral.placing import Placing, left_out, place_bands
 from skyquilt.multispectral.reflectance import Kind
 from skyquilt.multispectral.rig import FindBandRig
@@ -98,6 +99,7 @@ def _bands(made: FinishedMap, others: Sequence[Photo]) -> Generator[Event, None,
     placing = place_bands(scene, others, clock.workers)
     placed = yield from clock.stage("rig", placing, keeps=False)
     yield from (Note(text=t, warning=True) for t in (*placed.notes, *left_out(placed.lost)))
+    yield from [placed.panel] if placed.panel else []
     bands, lost, made_files = yield from _drawn(made, scene, placed, clock, key)
     for name in {*ADDED} - {*made_files, THERMAL_FILE}:  # of an earlier run with other bands
         remove_file(output / name)
@@ -146,7 +148,7 @@ def _key(made: FinishedMap, scene: Scene, others: Sequence[Photo]) -> str:
         content_digest(boundary) if boundary is not None and boundary.is_file() else "",
         made.methods.blend,
         sorted((p.name, p.pixels_key) for p in (*aligned.photos, *others)),
-        (FindBandRig(), place_bands, BandsDrawing),
+        (FindBandRig(), place_bands, by_panels, BandsDrawing),
         __version__,
     )
 

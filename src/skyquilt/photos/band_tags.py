@@ -24,6 +24,7 @@ SUN = 3.0
 """More than the sun gives, in W/m2/nm: at the top of the atmosphere it is 2.1 at most."""
 _WAVELENGTH, _WIDTH = (200.0, 20_000.0), (0.5, 15_000.0)
 _EXPOSURE_S, _GAIN, _APERTURE = (1e-7, 60.0), (1e-3, 1e4), (0.3, 100.0)
+_REFLECTANCE = (0.01, 1.2)
 _LEAST, _MOST = 1e-9, 1e9
 """Limits of numbers whose unit is the maker's own."""
 _MOST_TERMS, _MOST_POWER, _MOST_RADIAL = 64, 8, 8
@@ -60,6 +61,16 @@ class Vignetting:
     corrects: bool = False
     """Whether counts are multiplied by it, as DJI's are; else it is the share of the light that
     arrives, and they are divided by it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Panel:
+    """A panel of known reflectance in the picture."""
+
+    reflectance: float
+    """Its reflectance in the file's band."""
+    corners: tuple[tuple[float, float], ...]
+    """Column and row in px of its four corners, from the centre of the first pixel."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,6 +111,8 @@ class BandTags:
     """Whether it is in W/m2/nm; else its unit is the maker's own."""
     normalised: bool = False
     """Whether its values are corrected already: it says so, or they are real numbers."""
+    panel: Panel | None = None
+    """A panel that the camera recognised (MicaSense)."""
     notes: tuple[str, ...] = ()
     """Sentences on what was ignored."""
 
@@ -138,6 +151,7 @@ def band_tags(header: Header) -> BandTags:
         irradiance=irradiance,
         irradiance_si=si,
         normalised=said.normalised(),
+        panel=said.panel(),
         notes=tuple(said.notes),
     )
 
@@ -211,6 +225,15 @@ class _Said:
         """Whether the values are no counts."""
         said = self.xmp.text("Camera:IsNormalized").lower() in ("1", "true")
         return said or self.header.stored.startswith("float")
+
+    def panel(self) -> Panel | None:
+        """A panel whose reflectance and place are told."""
+        reflectance = self.number("Albedo", _REFLECTANCE)
+        corners = self.numbers("ReflectArea", 8, 8) if reflectance else ()
+        if reflectance is None or not corners:
+            return None
+        pairs = zip(corners[::2], corners[1::2], strict=True)
+        return Panel(reflectance=reflectance, corners=tuple(pairs))
 
     def index(self) -> int | None:
         """The camera's number in the rig."""

@@ -1,0 +1,159 @@
+"""Pictures of a panel of known reflectance on the ground, which tell how bright the light was: more
+truly than a sun sensor, and where there is none.
+
+MicaSense's cameras recognise their panel, and write its reflectance and its place into the files.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.model.event import Note
+from skyquilt.model.photo import Photo
+from skyquilt.multispectral.captures import THERMAL, BandFiles
+from skyquilt.multispectral.draw import PlacedBand
+from skyquilt.multispectral.reflectance import Reflectance
+from skyquilt.photos.band_tags import BandTags, Panel
+from skyquilt.photos.pixels import read_color
+from skyquilt.photos.together import clocks
+
+_INNER = 0.8
+"""Share of a panel's sides that is measured: its rim may lie beside it."""
+_LEAST_PX = 25
+"""Pixels of a panel that are enough."""
+_UNEVEN = 0.15
+"""Standard deviation of a panel's pixels, as a share of their mean, from which something lies on
+it, or it lies elsewhere."""
+_DIFFERS = 1.5
+"""Factor between panel and sun sensor from which it is told."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Seen:
+    """What one file with a panel tells."""
+
+    time_s: float
+    """When it was taken; NaN: not known."""
+    light: float
+    """Irradiance in which the panel has its reflectance."""
+    sensor: float | None
+    """That of the sun sensor, in its own unit."""
+
+
+def by_panels(
+    placed: Sequence[PlacedBand], shot: Sequence[BandFiles]
+) -> tuple[list[PlacedBand], Note | None]:
+    """The bands as reflectances, where pictures of a panel tell the light of each of them, and
+    what to tell of it. `shot`: all files of all bands, those that are not drawn too.
+
+    Where files have readings of a sun sensor, these are multiplied by what panels measure over them
+    (median); else the light of a file is that between the panels before and after it.
+    """
+    light = [b.files.name for b in placed if b.files.name != THERMAL]
+    with_panel = [b for b in shot if any(t.panel for t in b.tags)]
+    if not light or not with_panel:
+        return list(placed), None
+    seen: dict[str, list[_Seen]] = {}
+    reasons: dict[str, str] = {}
+    for band in with_panel:
+        found = [_look(*item) for item in zip(band.photos, band.tags, band.converts, strict=True)]
+        when = clocks(band.photos)
+        for at, said in zip(when, found, strict=True):
+            if isinstance(said, _Seen):
+                seen.setdefault(band.name, []).append(replace(said, time_s=float(at)))
+            elif said:
+                reasons.setdefault(band.name, said)
+    lacking = [name for name in light if name not in seen]
+    if lacking:
+        why = reasons.get(lacking[0], "no file of it shows one")
+        return list(placed), Note(
+            text=f"The pictures of a panel are not used: the band {lacking[0]} has none that can"
+            f" be ({why}), and values of bands must be comparable.",
+            warning=True,
+        )
+    bands: list[PlacedBand] = []
+    factors: list[float] = []
+    for one in placed:
+        if one.files.name == THERMAL:
+            bands.append(one)
+            continue
+        converts, factor = _lit(one.files, seen[one.files.name])
+        bands.append(replace(one, files=replace(one.files, converts=converts)))
+        factors += [factor] if factor else []
+    return bands, _note(max(map(len, seen.values())), factors)
+
+
+def _note(pictures: int, factors: Sequence[float]) -> Note:
+    """What is told; `factors`: panel over sun sensor, by band, where that measures irradiances."""
+    many = f"{pictures} pictures" if pictures > 1 else "a picture"
+    told = f"Values are reflectances by {many} of a panel"
+    if not factors:
+        return Note(text=f"{told}.")
+    low, high = min(factors), max(factors)
+    told += f" and the sun sensor, whose readings are multiplied by {low:.2f} to {high:.2f}"
+    if low > 1 / _DIFFERS and high < _DIFFERS:
+        return Note(text=f"{told}.")
+    return Note(
+        text=f"{told}: one of both is far off. Look whether the panel lay in the sun, without a"
+        " shadow on it or on the sensor; without these pictures the sensor alone counts.",
+        warning=True,
+    )
+
+
+def _lit(files: BandFiles, seen: Sequence[_Seen]) -> tuple[tuple[Reflectance, ...], float | None]:
+    """How a band's counts become reflectances, and the factor of the sun sensor's readings, None
+    where there is no sensor that measures irradiances.
+    """
+    both = [s.light / s.sensor for s in seen if s.sensor]
+    factor = float(np.median(both)) if both else None
+    times, light = np.array([(s.time_s, s.light) for s in seen]).T
+    timed = np.isfinite(times)
+    order = np.argsort(times[timed], kind="stable")
+    found, read = [], False
+    for convert, at in zip(files.converts, clocks(files.photos), strict=True):
+        if convert.kind == "counts":
+            found.append(convert)
+            continue
+        if factor is not None and convert.irradiance is not None:
+            own = factor * convert.irradiance
+            read = read or convert.best == "reflectance"
+        elif timed.any() and np.isfinite(at):
+            own = float(np.interp(at, times[timed][order], light[timed][order]))
+        else:
+            own = float(light.mean())
+        found.append(replace(convert, kind="reflectance", best="reflectance", irradiance=own))
+    return tuple(found), factor if read else None
+
+
+def _look(photo: Photo, tags: BandTags, convert: Reflectance) -> _Seen | str:
+    """What a file with a panel tells, else why it tells nothing; empty where it shows none."""
+    if tags.panel is None or convert.kind == "counts":
+        return "the files do not say how their counts came about" if tags.panel else ""
+    try:
+        counts = read_color(photo)
+    except Exception:  # whatever it is, it concerns this file alone; told when it is looked at
+        return f"{photo.name} cannot be read"
+    inside = _inside(tags.panel, counts.shape[:2])
+    if inside.sum() < _LEAST_PX:
+        return f"that in {photo.name} lies outside the picture"
+    values = convert.as_kind("radiance")(counts.reshape(counts.shape[:2]))[inside]
+    if not np.isfinite(values).all():
+        return f"that in {photo.name} is overexposed"
+    mean = float(values.mean())
+    if not mean > 0 or values.std() > _UNEVEN * mean:
+        return f"that in {photo.name} is not evenly bright"
+    light = math.pi * mean / tags.panel.reflectance
+    return _Seen(time_s=math.nan, light=light, sensor=convert.irradiance)
+
+
+def _inside(panel: Panel, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Pixels (h, w) of a panel, without its rim."""
+    corners = np.array(panel.corners)
+    inner = corners.mean(0) + _INNER * (corners - corners.mean(0))
+    drawn = np.zeros(shape, np.uint8)
+    cv2.fillConvexPoly(drawn, cv2.convexHull(np.rint(inner).astype(np.int32)), 1)
+    return drawn > 0
