@@ -44,6 +44,17 @@ def test_a_yaw_that_lies():
     assert "upside down" in found[1].meaning and "upside down" not in found[0].meaning
 
 
+@pytest.mark.parametrize(("off", "signs"), [(180.0, True), (-170.0, True), (90.0, False)])
+def test_headings_that_are_all_half_a_turn_off(off, signs):
+    """So are those of positions on the other side of the globe."""
+    photos, _ = survey()
+    told = [prior((0, 15 * i, 60), yaw=10.0 + off) for i in range(8)]
+    found = conflicts(photos, told, alignment())
+    assert len(found) == 8 and all(
+        ("both have the wrong sign" in c.meaning) == signs for c in found
+    )
+
+
 @pytest.mark.parametrize(
     ("off", "sigma", "accused"),
     [(14.0, 5.0, 0), (16.0, 5.0, 1), (40.0, 15.0, 0), (50.0, 15.0, 1), (-16, 5, 1)],

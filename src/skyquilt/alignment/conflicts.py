@@ -75,6 +75,8 @@ def _yaw(
         f"the reported heading ({prior.yaw_source}) is wrong by {off:+.0f} degrees: a compass or"
         " gimbal that was not calibrated"
     )
+    if abs(abs(common) - 180) < GROSS_DEG and abs(own) < GROSS_DEG:
+        why += ", or latitude and longitude both have the wrong sign: look where the map lies"
     if turned:
         why = "another program has turned the file upside down, not its metadata"
     elif abs(abs(off) - 90) < 20 and photo.height > photo.width:
