@@ -118,6 +118,7 @@ def test_nothing_new_changes_nothing(flown):
     assert all(same_pose(p, again.poses[i]) for i, p in whole.poses.items())
 
 
+@pytest.mark.slow
 def test_photos_that_join_two_blocks_need_all_of_them(flown):
     """Two lines on either side of one that is not there yet are blocks of their own."""
     bridge = tuple(range(16, 24))

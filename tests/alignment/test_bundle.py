@@ -176,9 +176,8 @@ class StoppedError(Exception):
     pass
 
 
-@pytest.mark.parametrize(
-    "factored", [pytest.param(600, marks=pytest.mark.slow), 5]
-)  # photos up to which each step has its factor
+@pytest.mark.slow
+@pytest.mark.parametrize("factored", [600, 5])  # photos up to which each step has its factor
 def test_an_interrupted_adjustment_of_many_photos_goes_on_at_its_iteration(
     plain, monkeypatch, factored
 ):
@@ -555,7 +554,7 @@ def test_photos_that_show_nothing_are_told(blank, told):
 
 
 @pytest.mark.parametrize(
-    "aspect", [0.75, 1.03, *(pytest.param(a, marks=SLOW) for a in (0.95, 1.33))]
+    "aspect", [1.03, *(pytest.param(a, marks=SLOW) for a in (0.75, 0.95, 1.33))]
 )
 def test_pictures_that_are_stretched_are_taken_as_they_are(aspect):
     """As well as pictures that nobody resized, whose centres are found to 0.35 m."""

@@ -103,9 +103,8 @@ def panorama(tilt, drift_m):
     return [(*off[k].tolist(), 360.0 * k / 20 - 180, tilt) for k in range(20)]
 
 
-@pytest.mark.parametrize(
-    ("tilt", "drift_m"), [(45.0, 0.0), pytest.param(45.0, 0.1, marks=pytest.mark.slow), (52.0, 0.4)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("tilt", "drift_m"), [(45.0, 0.0), (45.0, 0.1), (52.0, 0.4)])
 def test_a_panorama_keeps_its_positions_and_is_placed_by_its_angles(tilt, drift_m):
     """Its photos show places far apart and were taken from one: what only turns has no parallax."""
     survey = Slanting(panorama(tilt, drift_m))

@@ -73,6 +73,7 @@ def focal_by(block, px, relative):
     return state.K[0, 0] - block.truth.K[0, 0], sigma
 
 
+@pytest.mark.slow
 def test_blunt_observations_of_what_stands_high_do_not_decide_a_focal_length():
     """As crowns are, the fifth of all points that differs most in height is seen ten times less
     exactly. Untold, the adjustment errs more, and by more than it states.

@@ -318,6 +318,7 @@ def test_walls_around_what_photos_show_from_above_are_told():
     assert tilt_warnings(round_about.priors, found) == []  # nothing is shown from above
 
 
+@pytest.mark.slow
 def test_an_orbit_begun_as_if_it_looked_down_is_begun_again(monkeypatch):
     """The first adjustment ends with the whole block tilted by ten degrees."""
     flown = Slanting(orbit(20, 50), seed=1)

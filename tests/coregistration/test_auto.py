@@ -173,6 +173,7 @@ def test_what_shows_nothing_is_refused_by_every_method(what, method):
         assert reason in refused.reason and f"picture {name}" in refused.reason
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["auto", "structure"])
 def test_what_has_no_place_for_a_keypoint_is_refused(method):
     """Measurements in a lattice of strips, too narrow for any keypoint, but a quarter of all."""

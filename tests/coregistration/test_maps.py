@@ -309,6 +309,7 @@ def test_a_world_file_and_the_projection_beside_it(scene, tmp_path):
     assert CRS(open_picture(tmp_path / "b.jpg").place.crs).equals(CRS("EPSG:32633"))
 
 
+@pytest.mark.slow
 def test_a_small_map_in_a_large_one_is_compared_at_its_own_size(tmp_path):
     """A map of 6000 px was reduced to 2048, and the small one with it to a third. One of 2200 px
     would be as well, by a little.

@@ -105,6 +105,7 @@ def test_pictures_and_page(done):
     assert "b.png on a.jpg" in page
 
 
+@pytest.mark.slow
 def test_a_refusal_is_written_down_and_has_its_exit_code(files, tmp_path, capsys):
     folder, _, _ = files
     output = tmp_path / "out"

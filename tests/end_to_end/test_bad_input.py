@@ -200,6 +200,7 @@ def test_photos_of_five_bands_give_a_map_of_five(mosaic, photos):
     assert found[shown][:, 3:] == pytest.approx(0.75 * found[shown][:, :2], abs=1.5)
 
 
+@pytest.mark.slow
 def test_two_cameras_are_both_used(mosaic, photos, flight):
     for path in named(photos)[-4:]:
         path.unlink()
@@ -378,6 +379,7 @@ def test_gps_zero_zero_of_one(mosaic, photos):
     assert "1 of 9 photos lack a usable GPS position" in told.notes
 
 
+@pytest.mark.slow
 def test_gps_of_one_photo_300_km_away(mosaic, photos, finished):
     far = named(photos)[3]
     relabel(far, place=(49.3, 14.3))

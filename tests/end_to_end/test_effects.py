@@ -166,6 +166,7 @@ def made(photos, output, asked):
     return {k: v for k, v in told.items() if k not in ("run.toml", "report.html")}
 
 
+@pytest.mark.slow
 def test_what_the_photos_make_idle_is_said(mosaic, flight):
     """Whether there are videos and measured values is known when the photos are read."""
     told = mosaic(

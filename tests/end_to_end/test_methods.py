@@ -108,6 +108,7 @@ def test_equal_seeds_give_equal_maps(mosaic, lines, tmp_path):
     assert np.array_equal(a, b) and not np.array_equal(a, c)
 
 
+@pytest.mark.slow
 def test_known_distances_are_measured_on_the_map(mosaic, lines, tmp_path):
     """Between the control points: known to 2 cm."""
     rows = [r.split("\t") for r in (lines / "gcp_list.txt").read_text().splitlines()[1:]]

@@ -298,6 +298,7 @@ def test_rerun_from_each_stage(mosaic, flight, finished, again, stage):
     same_result(again, finished)
 
 
+@pytest.mark.slow
 def test_damaged_intermediate_results_are_made_again(mosaic, flight, finished, again):
     for number, path in enumerate(sorted((again / ".skyquilt" / "store").rglob("*.npz"))):
         data = path.read_bytes()
@@ -477,14 +478,15 @@ def test_ctrl_c_twice(flight, tmp_path):
     assert seconds < 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "moment",
     [
         ("StageProgress", "features", 4),
-        late(("StageStarted", "links", 1)),
-        late(("StageStarted", "mosaic", 1)),
-        late(("StageFinished", "mosaic", 1)),
-        late(("StageStarted", "report", 1)),
+        ("StageStarted", "links", 1),
+        ("StageStarted", "mosaic", 1),
+        ("StageFinished", "mosaic", 1),
+        ("StageStarted", "report", 1),
     ],
 )
 def test_kill_9_and_the_same_command_resumes(mosaic, flight, tmp_path, request, moment):

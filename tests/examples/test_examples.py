@@ -45,6 +45,7 @@ def test_two_photos(small_flight):  # noqa: F811
     assert re.search(r"linked by \d{2,} matches", said)
 
 
+@pytest.mark.slow
 def test_photo_by_photo(small_flight):  # noqa: F811
     said = run("02_photo_by_photo.py", small_flight / "photos")
     assert re.search(r"9 photos, ([89]|[12]\d) links, frame EPSG:32633", said)

@@ -130,6 +130,7 @@ def test_a_full_disk_refuses_and_loses_nothing(flight, tmp_path, monkeypatch):
     live.close()
 
 
+@pytest.mark.slow
 def test_a_database_that_cannot_grow_refuses_and_loses_nothing(flight, tmp_path):
     """SQLite itself is told that the disk is full: its page limit is what a small disk is."""
     from skyquilt.errors import OutputError

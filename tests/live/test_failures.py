@@ -361,6 +361,7 @@ def stored(live):
     return {str(n): live.folder / "photos" / str(f) for n, f in rows}
 
 
+@pytest.mark.slow
 def test_a_stored_photo_that_is_lost_is_told_and_taken_again(flight, tmp_path):
     """From its folder at the next start; sent by HTTP, when it is sent again."""
     inbox = tmp_path / "in"

@@ -123,6 +123,7 @@ def test_images_that_are_refused(site, query):
     assert time.process_time() - began < 0.5
 
 
+@pytest.mark.slow
 def test_the_largest_image_costs_little(site):
     side = int(MOST_PIXELS**0.5)
     query = f"{MAP}&BBOX={box(site)}&LAYERS=mosaic&WIDTH={side}&HEIGHT={side}&TRANSPARENT=TRUE"
@@ -473,6 +474,7 @@ def test_the_viewer_ends_with_its_parent_and_the_port_is_free_at_once(tmp_path):
         raise AssertionError("the viewer lives on")
 
 
+@pytest.mark.slow
 def test_absurd_heights_cost_little(tmp_path):
     """A photo of 1 MP from 3 km above a map that began at 5 m."""
     from tests.attacks import xmp

@@ -56,6 +56,7 @@ def heading_error_deg(live, flight, path):
     return abs(angle_difference_deg(placed, true))
 
 
+@pytest.mark.slow
 def test_a_turned_compass_is_learned_from_photos_that_settled(flight, drone, tmp_path):
     photos = sorted(drone.glob("*.jpg"))
     live = LiveMap(tmp_path / "out", SETTINGS)
@@ -166,6 +167,7 @@ def first_drawn(live, photos):
     return first
 
 
+@pytest.mark.slow
 def test_photos_without_headings_are_linked_before_they_are_drawn(flight, tmp_path):
     """They would be drawn with north at the top; the first one is, since nothing else tells."""
     photos = []

@@ -90,6 +90,7 @@ def test_an_adjustment_comes_back_into_the_frame_of_the_map(count):
     assert in_frame_of(done, {99: poses[0]}, 2.5) is None
 
 
+@pytest.mark.slow
 def test_without_positions_the_map_begins_with_four_and_tells_no_place(flight, tmp_path):
     """It is as true as a map can be without a place, and no other program is told one."""
     photos = placeless(flight.photos, tmp_path / "in")

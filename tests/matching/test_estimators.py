@@ -223,6 +223,7 @@ def test_ste_as_printed_breaks_where_the_extension_holds():
     assert mended.method == "RANSAC-2-OPT" and error(mended, H) < 0.5
 
 
+@pytest.mark.slow
 def test_ten_word_for_word_draws_hardly_any_sample():
     """log(0.01) / log(eps^S): by hand for half of six, and for nine tenths of 150."""
     assert needed_as_printed(0.99, 0.5, 6, 1000) == 2  # 4.605 / (6 * 0.693) = 1.11

@@ -83,6 +83,7 @@ def test_a_knocked_lens_is_found():
     assert np.median(apart_px(found, a, b, a.camera)) < 0.1
 
 
+@pytest.mark.slow
 def test_other_ground_is_refused():
     a, b = rig(3, *SIZE, FOCAL)
     pairs = captures(a, b)
@@ -92,6 +93,7 @@ def test_other_ground_is_refused():
     assert "of the patches of its photos agree" in found.reason
 
 
+@pytest.mark.slow
 def test_a_few_captures_of_other_ground_do_no_harm():
     a, b = rig(4, *SIZE, FOCAL)
     pairs = captures(a, b, 4)

@@ -192,6 +192,7 @@ def test_what_half_of_the_frames_show_is_no_pattern():
     assert Drift().patterns(views, half, FLAT, GRID.bounds) == {}
 
 
+@pytest.mark.slow
 def test_a_map_of_ringed_frames_has_no_rings():
     views, frames = strip()
     ringed = {k: f + RING for k, f in frames.items()}

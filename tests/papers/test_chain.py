@@ -163,6 +163,7 @@ def overview(flight, sizes=None):
     return method(flight.photos, FRAME, flight.priors, own, range(len(flight.photos)), flight.grey)
 
 
+@pytest.mark.slow
 def test_the_overview_is_searched_as_a_whole():
     flight, sizes = fly(line(6, heading=30.0), yaw=30.0), []
     found = overview(flight, sizes)

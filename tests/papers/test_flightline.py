@@ -36,6 +36,7 @@ def test_lines_of_any_direction_become_one_mosaic_in_its_place(heading):
     assert 0.001 < ground_error(flight, found, free=False) < 0.5
 
 
+@pytest.mark.slow
 def test_photos_that_look_back_along_every_other_line_are_no_matter():
     yaw = np.repeat([0.0, 180.0, 0.0], 5)
     flight = fly(lawn(3, 5, step=20.0, apart=30.0), yaw=yaw, points=6000)
@@ -51,6 +52,7 @@ def test_the_regression_averages_the_errors_of_positions():
     assert 0.1 < ground_error(flight, found, free=False) < 1.2
 
 
+@pytest.mark.slow
 def test_the_faithful_variant_refuses_a_line_that_turns_back():
     flight = fly(lawn(4, 5, step=25.0, apart=25.0))
     with pytest.raises(
@@ -100,6 +102,7 @@ def test_a_line_that_nothing_links_is_left_out_by_name():
     )
 
 
+@pytest.mark.slow
 def test_lines_around_a_field_are_joined_at_its_corners():
     sides = [
         line(6, 20.0),

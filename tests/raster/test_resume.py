@@ -108,6 +108,7 @@ with CogWriter(Path(sys.argv[1]), SPEC, digest="x") as writer:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="signals")
 def test_killed_process(tmp_path, whole):
     path = tmp_path / "a.tif"

@@ -112,6 +112,7 @@ def test_waves_move_from_photo_to_photo_and_the_shore_does_not(tmp_path):
     assert first[water].std() > 8
 
 
+@pytest.mark.slow
 def test_a_cliff_is_flown_and_low_flights_are_refused(tmp_path):
     assert get_args(TerrainName) == get_args(Terrain)
     words = ["--terrain", "cliff", "--photos", "2", "--size", "200x150", "--quiet"]

@@ -104,6 +104,7 @@ def test_values_are_resampled_only(maps, tmp_path):
     assert np.nanmedian(values) == pytest.approx(np.median(original), abs=0.3)
 
 
+@pytest.mark.slow
 def test_maps_that_state_too_large_an_error_are_not_joined(maps, tmp_path, monkeypatch):
     """This registration states 0.0002 to 0.0005 of the diagonal of 537 px."""
     a, b = maps

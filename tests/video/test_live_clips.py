@@ -79,6 +79,7 @@ def test_a_watched_folder_takes_the_frames_of_a_finished_clip(film, tmp_path):
         assert not any(h.samefile(folder / "A.MP4") for h in handles)
 
 
+@pytest.mark.slow
 def test_photos_are_taken_while_a_clip_is_looked_through(film, tmp_path, monkeypatch):
     """However long a clip is, a look at the folder takes a short time only."""
     monkeypatch.setattr(folder_watch, "PATIENCE_S", 0.1)

@@ -24,14 +24,9 @@ from tests.alignment.surveys import photo
 QUICK = {"surface": "ties", "gsd_cm": 30.0, "jobs": 2}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "asked",
-    [
-        pytest.param({}, marks=pytest.mark.slow),
-        pytest.param({"method": "image"}, marks=pytest.mark.slow),
-        {"method": "pose", "repair": False},
-    ],
-    ids=str,
+    "asked", [{}, {"method": "image"}, {"method": "pose", "repair": False}], ids=str
 )
 def test_the_scene_of_a_finished_map_is_found_not_made(small_flight, tmp_path, monkeypatch, asked):
     """Whatever the method: one that needs no links has none sought for it afterwards either."""
