@@ -194,7 +194,7 @@ def heights_for(settings: MosaicSettings) -> SurfaceFromPictures | None:
     chosen: dict[str, SurfaceFromPictures] = {
         "auto": Stereo(),
         "dense": Stereo(
-            fine=Level(longest=1400, window=3, wanted=4),
+            fine=Level(longest=1600, window=3, wanted=4),
             relief=0.0,
             edges=0.2,
             both_ways=True,
