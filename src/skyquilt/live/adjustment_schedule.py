@@ -108,11 +108,16 @@ class Blocks:
         self.folder, self.store, self.methods = folder, store, parts
         self.last_arrival = time.monotonic()
 
+    @property
+    def quiet(self) -> bool:
+        """Whether no photo has arrived for a while."""
+        return time.monotonic() - self.last_arrival > QUIET_S
+
     def due(self, ground: float, *, idle: bool) -> AdjustmentJob | None:
         """The block, or part of a block, that should be adjusted as a whole now; None where none is
         due. `ground`: height of the ground in m.
         """
-        quiet = idle and time.monotonic() - self.last_arrival > QUIET_S
+        quiet = idle and self.quiet
         if not self.settings.reposition or not (quiet or self.schedule.since):
             return None
         root = self._root() if self.schedule.since else self._unfinished()

@@ -308,6 +308,18 @@ class Ledger:
         with self.change() as db:
             db.executemany("insert or replace into link values (?, ?, ?)", links)
 
+    def forget_unlike(self, photos: Iterable[int]) -> None:
+        """Forgets that these photos were compared with others that they did not match."""
+        with self.change() as db:
+            query = "delete from link where body is null and (a = ? or b = ?)"
+            db.executemany(query, [(i, i) for i in photos])
+
+    def compared(self, one: int, other: int) -> bool:
+        """Whether two photos were compared, in any order."""
+        pair = min(one, other), max(one, other)
+        query = "select 1 from link where (a, b) in (values (?, ?), (?, ?))"
+        return self.row(query, *pair, *reversed(pair)) is not None
+
     def close(self) -> None:
         """Closes the file."""
         with self.lock:

@@ -105,8 +105,11 @@ class LiveLinks:
 
     def _of(self, camera: str) -> list[Link]:
         """Links of a camera's photos."""
-        ids = {i for i, m in self.members.by_id.items() if m.photo.camera_key == camera}
-        return self.links_among(self.members.by_id, ids)
+        return self.links_among(self.members.by_id, self._ids(camera))
+
+    def _ids(self, camera: str) -> set[int]:
+        """The photos of a camera."""
+        return {i for i, m in self.members.by_id.items() if m.photo.camera_key == camera}
 
     def _compare_again(self, camera: str, *, marked: bool, bent: bool) -> None:
         """Links of a camera's photos anew, after marks were found on its pictures, on which they
@@ -119,8 +122,9 @@ class LiveLinks:
             )
             if marked:
                 self.marks.keep(camera)
-            if bent:
+            if bent:  # what did not match by the other lens, may do so now
                 self.members.save_fisheye(camera)
+                self.members.ledger.forget_unlike(self._ids(camera))
         for a, b, link in links:
             if link is None:
                 self.members.parted(a, b)

@@ -364,6 +364,8 @@ class LiveMap:
         """Starts the adjustment of a block in a separate process."""
         if self.background.busy:
             return None
+        if self.blocks.quiet and (update := self.refinement.rejoined()) is not None:
+            return update
         job = self.blocks.due(self.canvas.ground, idle=True)
         if job is None:
             return None

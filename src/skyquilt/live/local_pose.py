@@ -1,6 +1,6 @@
 """The pose of a photo from its links: an adjustment with a bounded number of neighbours."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
@@ -89,6 +89,7 @@ class LocalPose:
             UnreadablePhotoError: it has no links, and is black or white all over.
         """
         links = self.live_links.compared(member, self.neighbours.of(member, member.pose))
+        links |= self._strangers(member, member.pose, links)
         good = {key: k for key, k in links.items() if k is not None}
         if not good:
             if self.live_links.shows_nothing(member.id, compared=bool(links)):
@@ -105,10 +106,24 @@ class LocalPose:
         # which others it overlaps
         near = [i for i in self.neighbours.of(member, found) if (i, member.id) not in links]
         more = self.live_links.compared(member, near)
+        more |= self._strangers(member, found, links | more)
         good |= {key: k for key, k in more.items() if k is not None}
         links |= more
         joined = self._joined(member, links, good) if any(more.values()) else change
         return joined if member.id in joined.moved else change
+
+    def _strangers(
+        self, member: Member, pose: Pose | None, links: Mapping[tuple[int, int], Link | None]
+    ) -> dict[tuple[int, int], Link | None]:
+        """A photo compared with the nearest of blocks that it is not linked with: where two blocks
+        meet, the nearest photos are those of one of them, and the other would stay apart.
+        """
+        if pose is None:
+            return {}
+        met = [i for key, k in links.items() if k is not None for i in key]
+        known = {i for key in links for i in key}
+        near = self.neighbours.strangers(member, pose, met)
+        return self.live_links.compared(member, [i for i in near if i not in known])
 
     def _joined(
         self,
@@ -226,7 +241,8 @@ class LocalPose:
         held = frozenset(ids) - moving - {member.id}
         # links with photos that have no pose, as those that wait, tell nothing here
         usable = [k for (a, _), k in good.items() if a in direct]
-        done = self.adjust_locally(self.window(member, ids, held, usable))
+        asked = self.window(member, ids, held, usable)
+        done = self.adjust_locally(asked)
         if isinstance(done, AdjustedWindow) and self._strays(
             {ids[k]: p for k, p in done.poses.items() if ids[k] != member.id}
         ):  # little holds a neighbour where the two meet, and it stood better
@@ -234,8 +250,9 @@ class LocalPose:
             done = self.adjust_locally(self.window(member, ids, held | stood, usable))
         if not isinstance(done, AdjustedWindow):
             return _unmoved(links, done.reason)
-        for key in done.dropped:
-            links[ids[key[0]], ids[key[1]]] = None
+        own = [k for k in asked.links if asked.new in (k.a, k.b)]
+        for key in self._wrong(own, asked.new, ids, done.dropped):
+            links[key] = None
         moved = {ids[k]: p for k, p in done.poses.items()}
         camera_of = {i: self.members.by_id[i].camera for i in moved} | {member.id: done.camera}
         return Change(
@@ -246,6 +263,26 @@ class LocalPose:
             xyz=done.xyz,
             observations=done.observations,
         )
+
+    def _wrong(
+        self,
+        own: Sequence[Link],
+        new: int,
+        ids: Sequence[int],
+        dropped: Collection[tuple[int, int]],
+    ) -> list[tuple[int, int]]:
+        """Those of the links of a photo (`new`: its place in `ids`) that contradict the others, and
+        are not believed. Blocks that only their positions place lie as far apart as these err: what
+        leads from one to another by enough matches contradicts nothing, and an adjustment of both
+        as a whole is due.
+        """
+        of = {(k.a, k.b): self.members.block_of[ids[k.other(new)]] for k in own}
+        kept = {block for key, block in of.items() if key not in dropped}
+        return [
+            (ids[k.a], ids[k.b])
+            for k in own
+            if (k.a, k.b) in dropped and (len(k.index_a) < AGAINST or of[k.a, k.b] in kept)
+        ]
 
     def _adjusted(self, photo: int) -> bool:
         """Whether a photo stands where an adjustment put it."""

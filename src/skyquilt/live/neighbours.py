@@ -1,17 +1,21 @@
 """Chooses the photos with which a new one is compared, by a spatial index of camera positions."""
 
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from itertools import islice
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.start import ground_of
 from skyquilt.live.drone_metadata import Metadata
 from skyquilt.live.members import Member, Members
 from skyquilt.live.settings import NEIGHBOURS
 from skyquilt.model.poses import Pose
 
+STRANGERS = 2
+"""Photos of blocks that a photo is not linked with, with which it is compared besides."""
 CELL_M = 30.0
 """Side of the cells of the index in m."""
 
@@ -51,10 +55,29 @@ class Neighbours:
         """
         if pose is None:
             return self._latest(member, most)
+        return self._nearest(member, pose)[:most]
+
+    def strangers(self, member: Member, pose: Pose, met: Iterable[int] = ()) -> list[int]:
+        """The nearest photos, of those like the ones that `of` gives, in other blocks of linked
+        photos than a photo at this pose and those that it has `met`.
+        """
+        block_of = self.members.block_of
+        known = {block_of[member.id], *(block_of[i] for i in met)}
+        if len(self.members.blocks) <= len(known):
+            return []
+        others = (
+            i
+            for i in self._nearest(member, pose)
+            if block_of[i] not in known and len(self.members.block(i)) > 1
+        )
+        return list(islice(others, STRANGERS))
+
+    def _nearest(self, member: Member, pose: Pose) -> list[int]:
+        """The photos that may show the same as one at this pose, nearest first."""
         photo = member.photo
         ground = self.metadata.ground_at(pose.map_C)
         at = self.aim(pose, ground)
-        above = max(float(pose.map_C[2]) - ground, 2.0)
+        above = max(float(pose.map_C[2]) - ground, self._told_above(member), 2.0)
         reach = (
             above * max(photo.width, photo.height) / photo.focal.px + 2 * self.metadata.scatter()
         )
@@ -70,7 +93,16 @@ class Neighbours:
             )
             if apart <= reach:
                 found.append((apart, i))
-        return [i for _, i in sorted(found)[:most]]
+        return [i for _, i in sorted(found)]
+
+    def _told_above(self, member: Member) -> float:
+        """Height in m above the place of take-off that a photo reports; 0 where it is not known.
+        The ground of the first photos is known no better than their distances, of positions that
+        err.
+        """
+        frame = self.members.frame
+        above = member.prior.map_C[2] - ground_of(frame) if frame is not None else np.nan
+        return float(above) if np.isfinite(above) else 0.0
 
     def _near(self, at: NDArray[Any], reach: float) -> list[int]:
         """Photos taken from above a square around a ground point. The search reaches beyond the

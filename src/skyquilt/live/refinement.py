@@ -1,6 +1,6 @@
 """The second step for a photo: it is linked to its neighbours and its pose is refined."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +52,7 @@ class Refinement:
         self.members, self.ledger = local_pose.members, local_pose.members.ledger
         self.blur, self.veils = blur, veils
         self.thermal_notes = ThermalNotes(blur.live_links)
+        self._moved = True
         self._tried = max((m.tried for m in self.members.by_id.values()), default=0)
 
     def refine(self, member: Member) -> Update:
@@ -144,6 +145,7 @@ class Refinement:
 
     def move(self, moved: dict[int, Pose], camera_of: dict[int, str]) -> None:
         """Stores new poses of photos (inside a transaction of the ledger)."""
+        self._moved = True
         for i, pose in moved.items():
             member = self.members.by_id[i]
             member.pose, member.camera = pose, camera_of.get(i, member.camera)
@@ -264,6 +266,38 @@ class Refinement:
             (m for m in lost if m.id not in partners), key=lambda m: (abs(m.id - member.id), -m.id)
         )[:LOST]
         return [*linked, *(m for m in others if self._links(m, member))]
+
+    def rejoined(self) -> Update | None:
+        """Compares a photo outside the largest block with one of another block near it, where no
+        photos arrive: later photos were compared with those that were nearest only. Where they
+        match, it waits to be refined again. None where there is no such photo.
+        """
+        pair = next(self._apart(), None) if self._moved else None
+        if pair is None:
+            self._moved = False
+            return None
+        member, other = pair
+        links = self.local_pose.live_links.compared(member, [other])
+        with self.ledger.change():
+            if any(links.values()):
+                self._again(member)
+            else:
+                self.ledger.put_links([(a, b, None) for a, b in links])
+        if any(links.values()):
+            self.queues.untried.append(member)
+        return Update(what="noted", photo=member.id)
+
+    def _apart(self) -> Iterator[tuple[Member, int]]:
+        """Photos on the map outside its largest block, each with one of another block near it with
+        which it was not compared.
+        """
+        largest = max(self.members.blocks.values(), key=len, default=set[int]())
+        for member in self.members.on_map():
+            if member.id in largest or member.pose is None or not member.tried:
+                continue
+            for i in self.local_pose.neighbours.strangers(member, member.pose):
+                if not self.ledger.compared(i, member.id):
+                    yield member, i
 
     def _links(self, lost: Member, member: Member) -> bool:
         return any(
