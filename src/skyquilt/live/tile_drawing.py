@@ -20,6 +20,7 @@ from skyquilt.imaging.grey import shrink
 from skyquilt.imaging.nodes import View
 from skyquilt.imaging.view_limits import COARSEST, ViewLimits, limits_for
 from skyquilt.imaging.views import footprint
+from skyquilt.live.coarse_views import yielding_to_finer
 from skyquilt.live.failures import concerning
 from skyquilt.live.ledger import hit
 from skyquilt.live.members import Member
@@ -396,11 +397,12 @@ class Canvas:
             return None
         west, south, east, north = grid.bounds
         rim = 8 * self.heights.cell
+        surface = self.surface((west - rim, south - rim, east + rim, north + rim))
         values = measured(self.members[inside[0].photo])
         return Composer(
             grid=grid,
-            views=inside,
-            surface=self.surface((west - rim, south - rim, east + rim, north + rim)),
+            views=yielding_to_finer(inside, self._sizes, surface, self.gsd),
+            surface=surface,
             blend=blend,
             pixels=self._pictures,
             bands=1 if values else 3,

@@ -137,8 +137,10 @@ def coarser_parts(
         finer &= ((low < up[k]) & (up > low[k])).all(1)
         if not size > MUCH_FINER * gsd or not finer.any():
             continue
-        others = [views[j] for j in np.flatnonzero(finer).tolist()]
-        mask, factor = _finer_shown(view, size, others, ground[k])
+        some = np.flatnonzero(finer)
+        straight = above[some] / focal[some]
+        others = [views[j] for j in some.tolist()]
+        mask, factor = finer_shown(view, size, others, straight, ground[k])
         if mask.any():
             found[view.photo] = around(mask, (view.camera.width, view.camera.height))
             factors.append(factor)
@@ -162,11 +164,12 @@ def _ground_below(alignment: Alignment, photos: Sequence[int]) -> NDArray[np.flo
     return np.array([float(np.median(n)) if len(n) else usual for n in z])
 
 
-def _finer_shown(
-    view: View, size: float, others: Sequence[View], height: float
+def finer_shown(
+    view: View, size: float, others: Sequence[View], sizes: NDArray[np.float64], height: float
 ) -> tuple[NDArray[np.bool_], float]:
     """Cells (h, w) of a photo whose ground, at this height in m, others show much finer than by
-    pixels of this size in m; and by what factor, in the median.
+    pixels of this size in m; and by what factor, in the median. `sizes` (n,) in m of the others'
+    pixels straight below them.
     """
     camera = view.camera
     cell = max(camera.width, camera.height) / FINER_CELLS
@@ -176,8 +179,7 @@ def _finer_shown(
     x, y, z = on_ground(view, px, level(height)).T.reshape(3, h, w)
     own, *rest = project_all([view, *others], x, y, z)
     finest, beneath = np.full((h, w), np.inf), np.full((h, w), np.inf)
-    for nodes in rest:
-        straight = (nodes.view.pose.map_C[2] - height) / nodes.view.camera.focal
+    for straight, nodes in zip(sizes.tolist(), rest, strict=True):
         longer = straight * (1 + nodes.score)
         better = nodes.seen & (longer < finest)
         finest = np.where(better, longer, finest)

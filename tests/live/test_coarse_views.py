@@ -1,0 +1,66 @@
+"""Photos of a growing map yield to much finer ones where its pixels show the difference."""
+
+import io
+
+import numpy as np
+import piexif
+import pytest
+from PIL import Image
+
+from skyquilt.imaging.views import make_views
+from skyquilt.live.coarse_views import yielding_to_finer
+from skyquilt.live.live_map import LiveMap
+from skyquilt.live.settings import LiveSettings
+from skyquilt.live.tile_drawing import WHOLE
+from skyquilt.ortho.blend import Feather
+from skyquilt.ortho.tie_surface import level
+from tests.live.conftest import fed
+from tests.ortho.test_sharpness import flight as levelled
+from tests.ortho.test_spoilt import of_two_cameras
+
+
+def test_a_higher_photo_yields_in_the_middle_of_its_picture():
+    """Every other photo is 40 m higher up: beside what the others show, nothing takes its place."""
+    views = make_views(of_two_cameras(levelled(10, apart=9.0), 40.0, 1.0), level(0.0))
+    sizes = {v.photo: float(v.pose.map_C[2]) / v.camera.focal for v in views}
+    fine, coarse = min(sizes.values()), max(sizes.values())
+    found = yielding_to_finer(views, sizes, level(0.0), fine)
+    marked = [v.photo for v in found if v.limits.mark is not None]
+    assert marked == [1, 3, 5, 7, 9]
+    room = found[5].limits.mark.at(np.full(3, 200.0), np.array([10.0, 150.0, 290.0]))
+    assert room[1] < 0 < min(room[0], room[2])
+    same = yielding_to_finer(views, sizes, level(0.0), 1.1 * coarse)  # the map shows it no finer
+    assert all(a is b for a, b in zip(same, views, strict=True))
+
+
+@pytest.mark.slow
+def test_a_growing_map_shows_the_finer_photos(flight, tmp_path):
+    """The two in the middle of each line have pixels five times as large: they were drawn where
+    they look down most steeply.
+    """
+    paths = []
+    for k, path in enumerate(flight.photos):
+        image = Image.open(path)
+        held = io.BytesIO()
+        exif = piexif.dump(piexif.load(image.info["exif"]))
+        size = (96, 72) if k in (1, 4) else image.size
+        image.resize(size).save(held, "JPEG", quality=95, exif=exif, xmp=image.info.get("xmp"))
+        paths.append(tmp_path / path.name)
+        paths[-1].write_bytes(held.getvalue())
+    live = fed(LiveMap(tmp_path / "out", LiveSettings(deterministic=True)), paths)
+    coarse = {m.id for m in live.members.on_map() if m.photo.width == 96}
+    assert len(coarse) == 2
+    both = shown = 0
+    for address in live.tiles.addresses("visible", 0):
+        compose = live.canvas._composer(address, Feather(width_px=2.0))
+        plan = compose.plan(WHOLE)
+        drawn = compose.drawn(plan).photo[8::16, 8::16]
+        rows, columns = drawn.shape
+        seen = [n.seen[1 : 1 + rows, 1 : 1 + columns] for i, n in plan.projected.items()
+                if i not in coarse]  # fmt: skip
+        fine = np.any(seen, axis=0) if seen else np.zeros(drawn.shape, bool)
+        both += int(fine.sum())
+        shown += int((fine & np.isin(drawn, list(coarse))).sum())
+    assert both > 100
+    assert shown < 0.08 * both
+    live.close()
