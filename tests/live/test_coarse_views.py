@@ -42,12 +42,17 @@ def test_a_growing_map_shows_the_finer_photos(flight, tmp_path):
     for k, path in enumerate(flight.photos):
         image = Image.open(path)
         held = io.BytesIO()
-        exif = piexif.dump(piexif.load(image.info["exif"]))
-        size = (96, 72) if k in (1, 4) else image.size
+        tags, size = piexif.load(image.info["exif"]), image.size
+        if k in (1, 4):
+            size = (96, 72)
+            for tag in ("FocalPlaneXResolution", "FocalPlaneYResolution"):
+                count, per = tags["Exif"][getattr(piexif.ExifIFD, tag)]
+                tags["Exif"][getattr(piexif.ExifIFD, tag)] = (count, 5 * per)
+        exif = piexif.dump(tags)
         image.resize(size).save(held, "JPEG", quality=95, exif=exif, xmp=image.info.get("xmp"))
         paths.append(tmp_path / path.name)
         paths[-1].write_bytes(held.getvalue())
-    live = fed(LiveMap(tmp_path / "out", LiveSettings(deterministic=True)), paths)
+    live = fed(LiveMap(tmp_path / "out", LiveSettings(deterministic=True, gsd_cm=15.0)), paths)
     coarse = {m.id for m in live.members.on_map() if m.photo.width == 96}
     assert len(coarse) == 2
     both = shown = 0
