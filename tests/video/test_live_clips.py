@@ -1,5 +1,7 @@
 """A clip in a watched folder becomes photos of the live map; its frames keep their metadata."""
 
+import json
+import re
 import shutil
 import sys
 import time
@@ -77,6 +79,26 @@ def test_a_watched_folder_takes_the_frames_of_a_finished_clip(film, tmp_path):
     if sys.platform == "linux":  # who sent the clip may remove it, on Windows too
         handles = [h for h in Path("/proc/self/fd").iterdir() if h.exists()]
         assert not any(h.samefile(folder / "A.MP4") for h in handles)
+
+
+def test_what_is_told_of_a_clip_is_told_to_viewers_once(film, tmp_path):
+    """Telemetry that begins 60 s after its clip, and lasts as long, begins with it."""
+    folder, out = tmp_path / "in", tmp_path / "out"
+    folder.mkdir()
+    out.mkdir()
+    clip = Path(shutil.copy(film, folder / "A.MP4"))
+    rows = film.with_suffix(".SRT").read_text()
+    late = re.sub(r"00:00:(\d\d[,.]\d+)", r"00:01:\1", rows)
+    clip.with_suffix(".SRT").write_text(late)
+    ledger = Ledger(out, write=True)
+    intake = Intake(ledger, Inbox(ledger, out / "photos"), LiveSettings())
+    for again in (False, True):  # as after a restart
+        done = [d for d in clip_intake.take_clip(intake, clip, "drone") if d is not None]
+        assert all(isinstance(d, Accepted) and d.duplicate == again for d in done)
+    told = [json.loads(body)["text"] for _, kind, body in ledger.told(0) if kind == "note"]
+    assert sum("taken to begin with the clip" in t for t in told) == 1
+    assert sum(f"A.MP4: {len(done)} frames of" in t for t in told) == 1
+    ledger.close()
 
 
 @pytest.mark.slow

@@ -17,6 +17,7 @@ from skyquilt.live.failures import of_the_system
 from skyquilt.live.inbox import SEEN
 from skyquilt.live.photo_intake import Accepted, Intake, Refused
 from skyquilt.model.clip import Clip
+from skyquilt.model.event import Note
 from skyquilt.photos.frame_files import frame_jpeg
 from skyquilt.photos.pixels import read_color
 from skyquilt.photos.read import rejected
@@ -29,6 +30,8 @@ from skyquilt.workflows.survey_input import SurveyInput, read_input
 
 SLICE_S = 0.1
 """Time in s that may be spent on clips before other work is done."""
+TOLD = "clips told"
+"""Name in the ledger of what was told of clips."""
 Taking = Iterator[Accepted | Refused | None]
 """Results of a clip; None after a piece of work without one."""
 
@@ -75,19 +78,27 @@ def take_clip(intake: Intake, path: Path, source: str, name: str = "") -> Taking
 
 
 def _looked(path: Path, name: str, intake: Intake) -> Generator[None, None, SurveyInput]:
-    """The clip's chosen frames as photos; yields None after each piece of work."""
+    """The clip's chosen frames as photos; yields None after each piece of work. What is told of the
+    clip, such as that its positions were not used, is told to viewers once.
+    """
     settings = InputSettings()
     store = Store(folder=intake.inbox.folder.parent / SEEN, registry=REGISTRY)
     given = read_input(path, settings)
     clips = tuple(replace(c, name=name) for c in given.survey.clips)
     steps = with_frames(replace(given, survey=replace(given.survey, clips=clips)), settings, store)
+    notes = list[str]()
     while True:
         try:
-            next(steps)
+            step = next(steps)
         except StopIteration as done:
             found: SurveyInput = done.value
-            return found
+            break
+        if isinstance(step, Note):
+            notes.append(step.text)
         yield None
+    with intake.ledger.change():
+        intake.ledger.tell_new(notes, TOLD, before="")
+    return found
 
 
 def advanced(taking: Taking) -> tuple[list[Accepted | Refused], bool]:

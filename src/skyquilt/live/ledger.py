@@ -54,6 +54,8 @@ def hit(name: str) -> None:
 
 DAMAGED = (ValueError, TypeError, LookupError, AttributeError, OverflowError, RecursionError)
 """What reading a record raises that nobody of ours has written."""
+NO_VALUE = "(?!)"
+"""A regular expression that nothing matches."""
 STAND_IN = "EPSG:3857"
 """The projection in which the page draws a map without a place, about its origin, where its metres
 are those of the map. Nothing else is told of it as if the map were there.
@@ -223,17 +225,19 @@ class Ledger:
                 (time.time(), kind, json.dumps(body)),
             )
 
-    def tell_new(self, notes: Iterable[str], key: str, values: str) -> None:
+    def tell_new(
+        self, notes: Iterable[str], key: str, values: str = NO_VALUE, before: str = "So far: "
+    ) -> None:
         """Appends notes for viewers that were not told before, but for other values (inside a
         transaction). `key`: under which what was told is remembered; `values`: a regular expression
-        for what differs where a note is the same.
+        for what differs where a note is the same; `before`: what each note begins with.
         """
         said = self.meta(key)
         told = {str(text) for text in said} if isinstance(said, list) else set[str]()
         for note in notes:
             if (kind := re.sub(values, "", note)) not in told:
                 told.add(kind)
-                self.tell("note", {"text": f"So far: {note}"})
+                self.tell("note", {"text": f"{before}{note}"})
         self.put_meta(key, sorted(told))
 
     def told(self, after: int, limit: int = 500) -> list[tuple[int, str, str]]:
