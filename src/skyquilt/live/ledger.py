@@ -324,6 +324,11 @@ class Ledger:
         query = "select 1 from link where (a, b) in (values (?, ?), (?, ?))"
         return self.row(query, *pair, *reversed(pair)) is not None
 
+    def compared_with(self, photo: int) -> int:
+        """Number of photos with which one was compared."""
+        row = self.row("select count(*) from link where a = ? or b = ?", photo, photo)
+        return 0 if row is None else int(row[0])
+
     def close(self) -> None:
         """Closes the file."""
         with self.lock:

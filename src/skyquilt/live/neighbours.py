@@ -59,7 +59,8 @@ class Neighbours:
 
     def strangers(self, member: Member, pose: Pose, met: Iterable[int] = ()) -> list[int]:
         """The nearest photos, of those like the ones that `of` gives, in other blocks of linked
-        photos than a photo at this pose and those that it has `met`.
+        photos than a photo at this pose and those that it has `met`. Those with which it was
+        compared are left out.
         """
         block_of = self.members.block_of
         known = {block_of[member.id], *(block_of[i] for i in met)}
@@ -68,7 +69,9 @@ class Neighbours:
         others = (
             i
             for i in self._nearest(member, pose)
-            if block_of[i] not in known and len(self.members.block(i)) > 1
+            if block_of[i] not in known
+            and len(self.members.block(i)) > 1
+            and not self.members.ledger.compared(i, member.id)
         )
         return list(islice(others, STRANGERS))
 

@@ -26,6 +26,8 @@ MOST_ASIDE, LEAST_BELOW, MOST_BELOW = 4.0, 0.1, 5.0
 """Ground lies this far beside the nearest photo at most, and this far below it at least and at
 most, all in flying heights.
 """
+MOST_COMPARED = 24
+"""Number of others with which a photo was compared, from which it is taken to match none."""
 LOST = 2
 """Number of photos without links, those that came next before or after it, with which a refined
 photo is compared.
@@ -295,8 +297,8 @@ class Refinement:
         for member in self.members.on_map():
             if member.id in largest or member.pose is None or not member.tried:
                 continue
-            for i in self.local_pose.neighbours.strangers(member, member.pose):
-                if not self.ledger.compared(i, member.id):
+            if self.ledger.compared_with(member.id) < MOST_COMPARED:
+                for i in self.local_pose.neighbours.strangers(member, member.pose):
                     yield member, i
 
     def _links(self, lost: Member, member: Member) -> bool:
