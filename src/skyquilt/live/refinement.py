@@ -54,7 +54,7 @@ class Refinement:
         self.members, self.ledger = local_pose.members, local_pose.members.ledger
         self.blur, self.veils = blur, veils
         self.thermal_notes = ThermalNotes(blur.live_links)
-        self._moved = True
+        self._pairs = self._apart()
         self._tried = max((m.tried for m in self.members.by_id.values()), default=0)
 
     def refine(self, member: Member) -> Update:
@@ -147,7 +147,7 @@ class Refinement:
 
     def move(self, moved: dict[int, Pose], camera_of: dict[int, str]) -> None:
         """Stores new poses of photos (inside a transaction of the ledger)."""
-        self._moved = True
+        self._pairs = self._apart()
         for i, pose in moved.items():
             member = self.members.by_id[i]
             member.pose, member.camera = pose, camera_of.get(i, member.camera)
@@ -274,9 +274,8 @@ class Refinement:
         photos arrive: later photos were compared with those that were nearest only. Where they
         match, it waits to be refined again. None where there is no such photo.
         """
-        pair = next(self._apart(), None) if self._moved else None
+        pair = next(self._pairs, None)
         if pair is None:
-            self._moved = False
             return None
         member, other = pair
         links = self.local_pose.live_links.compared(member, [other])
@@ -291,15 +290,19 @@ class Refinement:
 
     def _apart(self) -> Iterator[tuple[Member, int]]:
         """Photos on the map outside its largest block, each with one of another block near it with
-        which it was not compared.
+        which it was not compared; to the end as long as no photo moves.
         """
-        largest = max(self.members.blocks.values(), key=len, default=set[int]())
-        for member in self.members.on_map():
-            if member.id in largest or member.pose is None or not member.tried:
-                continue
-            if self.ledger.compared_with(member.id) < MOST_COMPARED:
-                for i in self.local_pose.neighbours.strangers(member, member.pose):
-                    yield member, i
+        more = True
+        while more:
+            more = False
+            largest = max(self.members.blocks.values(), key=len, default=set[int]())
+            for member in list(self.members.on_map()):
+                if member.id in largest or member.pose is None or not member.tried:
+                    continue
+                if self.ledger.compared_with(member.id) < MOST_COMPARED:
+                    for i in self.local_pose.neighbours.strangers(member, member.pose):
+                        more = True
+                        yield member, i
 
     def _links(self, lost: Member, member: Member) -> bool:
         return any(
