@@ -70,6 +70,18 @@ def test_a_precise_height_is_not_replaced_by_a_barometer():
     assert heights([exact, exact], "egm96") == pytest.approx(2 * [620 - N])
 
 
+def test_methods_of_level_ground_count_from_take_off_where_it_is_told():
+    exact = photo(
+        position=GeoPosition(
+            **PLACE, altitude_m=620.0, datum="ellipsoid", ellipsoid_m=620.0, takeoff_m=63.0
+        )
+    )
+    frame = choose_frame([exact], None, level=True)
+    assert frame.vertical_datum == "takeoff"
+    assert [p.map_C[2] for p in priors([exact], frame)] == [63.0]
+    assert choose_frame([rtk(620.0)], None, level=True).vertical_datum == "ellipsoid"
+
+
 @pytest.mark.parametrize(
     ("photos", "datum", "words"),
     [

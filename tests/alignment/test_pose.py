@@ -2,6 +2,8 @@
 4.4).
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from skyquilt.alignment.pose import ByPose, ByPosition
 from skyquilt.errors import AlignmentError
 from skyquilt.geometry.camera import project
 from skyquilt.geometry.frames import angles_from_cam_R_map
+from skyquilt.model.photo import GeoPosition
 from skyquilt.model.poses import MapFrame
 from tests.alignment.surveys import FOCAL, HEIGHT, WIDTH, photo, prior
 
@@ -86,7 +89,33 @@ def test_heights_that_do_not_tell_the_ground():
     with pytest.raises(AlignmentError, match="--height"):
         ByPose()(PHOTOS, sea, TOLD)
     found = ByPose(height_m=40.0)(PHOTOS, sea, TOLD)
-    assert [p.map_C[2] for p in found.poses.values()] == [32.0, 36.0, 40.0, 44.0, 48.0]
+    assert [p.map_C[2] for p in found.poses.values()] == [50.0, 54.0, 58.0, 62.0, 66.0]
+    assert found.ground_m == 18.0 and found.frame.vertical_datum == "sea_level"
+
+
+def test_heights_above_take_off_tell_where_the_ground_lies_in_another_datum():
+    """A receiver states ellipsoidal heights, the barometer beside it heights above take-off."""
+    place = {"latitude_deg": 50.8, "longitude_deg": -0.1}
+    above = [50.0, 54.5, 58.0, 61.5, 66.0]
+    photos = [
+        photo(
+            f"{i}.jpg",
+            position=GeoPosition(
+                **place, altitude_m=t.map_C[2] + 430, datum="ellipsoid", takeoff_m=h
+            ),
+        )
+        for i, (t, h) in enumerate(zip(TOLD, above, strict=True))
+    ]
+    told = [replace(t, map_C=t.map_C + [0, 0, 430]) for t in TOLD]
+    frame = replace(FRAME, vertical_datum="ellipsoid")
+    found = ByPose()(photos, frame, told)
+    assert found.ground_m == pytest.approx(430) and found.frame.vertical_datum == "ellipsoid"
+    assert [p.map_C[2] - 430 for p in found.poses.values()] == pytest.approx(above)
+    # heights by the scale of pictures, where nothing else is told: what they count from is not
+    found = ByPose()(
+        PHOTOS, frame, [prior((3.0 * i, 0, np.nan)) for i in range(5)], np.array(above)
+    )
+    assert found.ground_m == 0 and found.frame.vertical_datum == "unknown"
 
 
 def test_no_position_at_all():

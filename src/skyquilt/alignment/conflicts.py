@@ -105,9 +105,8 @@ def _altitudes(
     if not np.isfinite(off).any():
         return []
     off = off - np.nanmedian(off)
-    ground = float(np.median(alignment.ties.xyz[:, 2])) if len(alignment.ties.xyz) else 0.0
     out = []
-    for i, e, height in zip(held, off, z - ground, strict=True):
+    for i, e, height in zip(held, off, z - alignment.ground_m, strict=True):
         if np.isfinite(e) and abs(e) > max(2 * priors[i].sigma_C[2], 0.05 * height):
             reported = float(priors[i].map_C[2])
             where = "lower" if e > 0 else "higher"

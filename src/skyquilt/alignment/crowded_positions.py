@@ -84,8 +84,22 @@ def without_places(priors: Sequence[Prior]) -> tuple[Prior, ...]:
     )
 
 
+def without_heights(priors: Sequence[Prior]) -> tuple[Prior, ...]:
+    """The priors without heights, but with their positions."""
+    return tuple(
+        replace(
+            p, map_C=np.r_[p.map_C[:2], np.nan], sigma_C=np.r_[np.asarray(p.sigma_C)[:2], np.inf]
+        )
+        for p in priors
+    )
+
+
 def believed(found: Alignment, frame: MapFrame, priors: Sequence[Prior]) -> Sequence[Prior]:
-    """The priors that an alignment was made with, where it left the places of a frame out."""
+    """The priors that an alignment was made with, where it left places or heights of a frame
+    out.
+    """
+    if found.frame.vertical_datum == "unknown" != frame.vertical_datum:
+        priors = without_heights(priors)
     return without_places(priors) if frame.crs and not found.frame.crs else priors
 
 

@@ -24,16 +24,19 @@ VERTICAL_EPSG = {"egm96": 5773, "sea_level": 5773, "ellipsoid": 4979}
 
 
 def chosen_datum(
-    photos: Sequence[Photo], control: Sequence[ControlPoint], asked: str | None
+    photos: Sequence[Photo], control: Sequence[ControlPoint], asked: str | None, level: bool = False
 ) -> tuple[Datum, float | None]:
     """The datum of a map's heights, and the height of the take-off point above it where heights
-    above take-off are converted.
+    above take-off are converted. `level`: the method lays photos on level ground, for which
+    heights above take-off are taken where there are any.
 
     Raises:
         UsageError: what the photos report cannot be converted to the datum asked for.
     """
     positions = [p.position for p in photos if p.position and p.position.altitude_m is not None]
     if asked is None:
+        if level and any(p.takeoff_m is not None for p in positions):
+            return "takeoff", None
         count = Counter(p.datum for p in positions)
         return (count.most_common(1)[0][0] if count else "unknown"), None
     datum = cast(Datum, asked)

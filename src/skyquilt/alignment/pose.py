@@ -7,6 +7,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.start import OWN_ZERO, ground_of
 from skyquilt.errors import AlignmentError
 from skyquilt.geometry.frames import cam_R_map_from_angles
 from skyquilt.model.photo import Photo
@@ -19,7 +20,7 @@ class ByMetadata:
 
     height_m: float | None = None
     """Height above ground in m if the altitudes do not give it; None = heights above take-off."""
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     name: ClassVar[str] = "pose"
 
     def __call__(
@@ -46,8 +47,11 @@ class ByMetadata:
                 map_C=np.array([0.0, 0.0, self.height_m or 50.0]),
             )
         else:
-            heights = self._heights(frame, priors, heights_m)
+            heights = self._heights(photos, frame, priors, heights_m)
+            frame = on_ground(frame, priors, heights)
             poses, rejected = self._placed(photos, priors, heights)
+            ground = np.array([0.0, 0.0, ground_of(frame)])
+            poses = {i: replace(p, map_C=p.map_C + ground) for i, p in poses.items()}
         if not poses:
             raise AlignmentError(_nothing_placed(self.name, len(photos), rejected))
         return Alignment(
@@ -63,9 +67,13 @@ class ByMetadata:
         )
 
     def _heights(
-        self, frame: MapFrame, priors: Sequence[Prior], known: NDArray[np.float64] | None
+        self,
+        photos: Sequence[Photo],
+        frame: MapFrame,
+        priors: Sequence[Prior],
+        known: NDArray[np.float64] | None,
     ) -> NDArray[np.float64]:
-        """Camera heights (n,) in m above the ground, which is level at z = 0."""
+        """Camera heights (n,) in m above the ground, which is level."""
         if self.height_m is None and known is not None and np.isfinite(known).any():
             return np.where(np.isfinite(known), known, np.nanmedian(known))
         z = np.array([p.map_C[2] for p in priors])
@@ -76,6 +84,8 @@ class ByMetadata:
                 else np.full(len(z), self.height_m)
             )
         if frame.vertical_datum != "takeoff":
+            z = np.array([_above_takeoff(p) for p in photos])
+        if frame.vertical_datum != "takeoff" and not np.isfinite(z).any():
             told = frame.vertical_datum != "unknown"
             given = (
                 f"heights above {frame.vertical_datum.replace('_', ' ')}" if told else "no heights"
@@ -104,6 +114,24 @@ class ByMetadata:
     def _pose(self, prior: Prior, heights: NDArray[np.float64], i: int) -> Pose:
         R = cam_R_map_from_angles(prior.yaw_deg, prior.pitch_deg, prior.roll_deg)
         return Pose(cam_R_map=R, map_C=np.array([prior.map_C[0], prior.map_C[1], heights[i]]))
+
+
+def _above_takeoff(photo: Photo) -> float:
+    """A photo's height above take-off in m; NaN where it tells none."""
+    told = photo.height_m if photo.position is None else photo.position.takeoff_m
+    return np.nan if told is None else told
+
+
+def on_ground(frame: MapFrame, priors: Sequence[Prior], heights_m: NDArray[np.float64]) -> MapFrame:
+    """A frame that knows where its level ground lies, from heights of the photos above it (n,):
+    heights above take-off are taken for such.
+    """
+    if frame.vertical_datum in OWN_ZERO:
+        return frame
+    zero = np.array([p.map_C[2] for p in priors]) - heights_m
+    if not np.isfinite(zero).any():
+        return replace(frame, vertical_datum="unknown", takeoff_m=None)
+    return replace(frame, takeoff_m=float(np.nanmedian(zero)))
 
 
 def _nothing_placed(method: str, photos: int, rejected: dict[int, str]) -> str:

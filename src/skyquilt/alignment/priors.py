@@ -41,9 +41,11 @@ def choose_frame(
     crs: str | None,
     control: Sequence[ControlPoint] = (),
     vertical_datum: str | None = None,
+    level: bool = False,
 ) -> MapFrame:
     """The frame of a survey: `crs` if given, otherwise the UTM zone of the median position; heights
-    above `vertical_datum` if given, otherwise above what most photos state.
+    above `vertical_datum` if given, otherwise above what most photos state, or above take-off for
+    a method of `level` ground.
 
     Without photo positions, the UTM zone of the control points; without these, the survey is not
     georeferenced.
@@ -74,7 +76,7 @@ def choose_frame(
     convergence = Proj(name).get_factors(longitude, latitude).meridian_convergence
     if crs:
         _check_suits(name, latitude, longitude, convergence)
-    datum, takeoff = chosen_datum(photos, control, vertical_datum)
+    datum, takeoff = chosen_datum(photos, control, vertical_datum, level)
     return MapFrame(
         crs=name,
         origin=origin,

@@ -27,6 +27,8 @@ from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import MapFrame, Pose, Prior
 
+OWN_ZERO = ("takeoff", "unknown", "control")
+"""Datums in which the ground that heights are counted from lies at zero."""
 NOMINAL_HEIGHT_M = 50.0
 """Height above ground in m assumed if no data determine the scale; the result is then marked as not
 metric.
@@ -219,7 +221,7 @@ def _turn(a: NDArray[np.complex128], priors: Sequence[Prior]) -> complex:
 
 def ground_of(frame: MapFrame) -> float:
     """Height of the take-off point in a frame in m; NaN where nothing tells it."""
-    if frame.vertical_datum in ("takeoff", "unknown", "control"):
+    if frame.vertical_datum in OWN_ZERO:
         return 0.0
     return np.nan if frame.takeoff_m is None else frame.takeoff_m
 

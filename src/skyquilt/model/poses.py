@@ -249,6 +249,14 @@ class Alignment:
             sorted(i for block in self.blocks if len(block) > 1 for i in block if i in self.poses)
         )
 
+    @property
+    def ground_m(self) -> float:
+        """Height of the ground in m: the median of the tie points; without them that of the level
+        ground which photos were laid on.
+        """
+        z = self.ties.xyz[:, 2]
+        return float(np.median(z)) if len(z) else self.frame.takeoff_m or 0.0
+
     def camera(self, photo: int) -> Camera:
         """The calibration of a photo."""
         return self.cameras[self.camera_of[photo]]

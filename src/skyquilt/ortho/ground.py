@@ -108,7 +108,7 @@ def find_ground(
     """
     yield 0, 1
     xyz = alignment.ties.xyz
-    flat = level(float(np.median(xyz[:, 2])) if len(xyz) else 0.0)
+    flat = level(alignment.ground_m)
     blanks, notes = _blanks(alignment, see_through, grey)
     limits = view_limits(alignment, flat, picture.max_view_angle)
     limits = replace(limits, blanks=blanks, marks=marks)

@@ -15,7 +15,9 @@ from skyquilt.alignment.aligners import (
     placed_by_metadata,
     repaired_metadata,
 )
+from skyquilt.alignment.crowded_positions import without_heights
 from skyquilt.alignment.inputs import AlignmentInputs
+from skyquilt.alignment.start import OWN_ZERO
 from skyquilt.errors import UsageError
 from skyquilt.geometry.transforms import Model
 from skyquilt.matching.levelled import Level
@@ -62,7 +64,7 @@ class ByImage:
 
     method: Chain | DirectChain | ByOverview
     """The search method."""
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     needs_links: ClassVar[bool] = False
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -71,7 +73,7 @@ class ByImage:
         Raises:
             UsageError: a relief is given, but nothing tells the height that it is divided by (4.9).
         """
-        method = self.method
+        method, inputs = self.method, on_plain_ground(inputs)
         if not isinstance(method, DirectChain):
             level = method.level
             if isinstance(level, Level) and level.height_m is None:
@@ -80,6 +82,16 @@ class ByImage:
                     height = _height_by_scale(replace(method, level=None), inputs)
                 method = replace(method, level=replace(level, height_m=height))
         return _outside_named(replace(_placed(method, inputs), why=REQUESTED), inputs)
+
+
+def on_plain_ground(inputs: AlignmentInputs) -> AlignmentInputs:
+    """The inputs for methods that lay photos on a plane at zero: heights above the sea or the
+    ellipsoid are none above it.
+    """
+    if inputs.frame.vertical_datum in OWN_ZERO:
+        return inputs
+    frame = replace(inputs.frame, vertical_datum="unknown", takeoff_m=None)
+    return replace(inputs, frame=frame, priors=without_heights(inputs.priors))
 
 
 def _placed(method: Chain | DirectChain | ByOverview, inputs: AlignmentInputs) -> Alignment:
@@ -99,7 +111,7 @@ class Corrected:
     """First placement."""
     hybrid: Hybrid
     """Correction."""
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     @property
     def needs_links(self) -> bool:
@@ -115,7 +127,10 @@ class Corrected:
         repaired = repaired_metadata(inputs) if self.pose.repair else None
         placed = placed_by_metadata(self.pose.method, inputs, repaired)
         priors = inputs.priors if repaired is None else repaired.priors
-        found = self.hybrid(placed, inputs.photos, priors, inputs.order, inputs.grey)
+        zero, ground = np.zeros(3), np.array([0.0, 0.0, placed.ground_m])
+        low = placed.carried(np.eye(3), 1.0, ground, zero)  # its ground lies at zero
+        found = self.hybrid(low, inputs.photos, priors, inputs.order, inputs.grey)
+        found = found.carried(np.eye(3), 1.0, zero, ground)
         return _outside_named(replace(found, why=REQUESTED), inputs)
 
 
@@ -125,7 +140,7 @@ class ByLines:
 
     method: ByFlightline
     """The article's method."""
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     needs_links: ClassVar[bool] = False
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -134,6 +149,7 @@ class ByLines:
         Raises:
             AlignmentError: lines cannot be separated, or do not match.
         """
+        inputs = on_plain_ground(inputs)
         found = self.method(
             inputs.photos, inputs.frame, inputs.priors, inputs.features, inputs.order
         )

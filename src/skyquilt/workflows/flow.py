@@ -13,7 +13,7 @@ from pathlib import Path
 
 from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.motion import speeds_of
-from skyquilt.alignment.priors import choose_frame, priors
+from skyquilt.alignment.priors import priors
 from skyquilt.alignment.progress import AdjustmentSteps
 from skyquilt.alignment.repairs import priors_taken
 from skyquilt.engine.clock import Clock, CountedParts, Steps, apart
@@ -49,7 +49,7 @@ from skyquilt.workflows.photo_features import (
     pixels_of,
 )
 from skyquilt.workflows.second_look import connect
-from skyquilt.workflows.survey_input import SurveyInput
+from skyquilt.workflows.survey_input import SurveyInput, frame_of
 
 ADJUSTED_GB, ADJUSTED_PHOTO_GB = 0.5, 0.00014
 """Memory in GB of an adjustment, and how much more for each photo (measured: docs/scale.md)."""
@@ -170,13 +170,12 @@ def align_photos(
     found = of_one_kind(found)
     pixels = PixelsInUse(found.photos, found.number, cache)
     grey = GreyPictures(found.photos, pixels, store)
-    picture = settings.picture
     if earlier is not None and not earlier.complete(found.photos):
         earlier = None
     if earlier is not None:
         frame = earlier.finished.frame
     else:
-        frame = choose_frame(found.photos, picture.crs, given.control, picture.vertical_datum)
+        frame = frame_of(found.photos, given.control, settings)
     reported = priors(found.photos, frame)
     linking = _links(found, frame, reported, grey, methods, store, workers)
     found, links = yield from clock.stage("links", linking)

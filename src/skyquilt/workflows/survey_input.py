@@ -5,16 +5,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from skyquilt.alignment.priors import choose_frame
-from skyquilt.effects import option_of
+from skyquilt.effects import option_of, taken
 from skyquilt.errors import PhotoFailedError, SkyquiltError, UsageError
 from skyquilt.model.clip import ChosenFrames
 from skyquilt.model.photo import (
     ControlPoint,
     KnownDistance,
+    Photo,
     PointObservation,
     RejectedPhoto,
     Survey,
 )
+from skyquilt.model.poses import MapFrame
 from skyquilt.outside import same_folder
 from skyquilt.photos.detector_faults import Repair
 from skyquilt.photos.distances import read_distances
@@ -203,6 +205,19 @@ def completed(given: SurveyInput, settings: InputSettings) -> SurveyInput:
     )
 
 
+def frame_of(
+    photos: Sequence[Photo], control: Sequence[ControlPoint], settings: MosaicSettings
+) -> MapFrame:
+    """The map frame of photos by the settings.
+
+    Raises:
+        UsageError: the CRS or the height datum asked for cannot be had.
+    """
+    picture = settings.picture
+    level = not taken(settings.method, "vertical_datum")
+    return choose_frame(photos, picture.crs, control, picture.vertical_datum, level)
+
+
 def check_input(given: SurveyInput, output: Path, settings: MosaicSettings) -> SurveyInput:
     """Checks that options and output folder suit the survey, before anything is computed or
     replaced. The survey has notes on options that have no effect on its photos.
@@ -216,9 +231,7 @@ def check_input(given: SurveyInput, output: Path, settings: MosaicSettings) -> S
             f"{output} contains the photos; choose another folder for the results, such as"
             f" {output / 'map'}"
         )
-    frame = choose_frame(
-        given.survey.photos, settings.picture.crs, given.control, settings.picture.vertical_datum
-    )
+    frame = frame_of(given.survey.photos, given.control, settings)
     _check_exists("boundary", settings.picture.boundary)
     if settings.picture.boundary is not None and not given.survey.clips:
         if frame.crs is None:
