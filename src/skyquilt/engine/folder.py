@@ -4,7 +4,7 @@ import errno
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -155,6 +155,16 @@ def stamp(path: Path) -> str:
     except OSError:
         return ""
     return f"{size} {content.hexdigest()}"
+
+
+def stamps(folder: Path, names: Iterable[str]) -> dict[str, str]:
+    """What tells each of these files of a folder from another one."""
+    return {name: stamp(folder / name) for name in names}
+
+
+def as_written(folder: Path, files: object) -> bool:
+    """Whether files are as their `stamps` say; False where there are none."""
+    return isinstance(files, dict) and bool(files) and files == stamps(folder, files)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,13 +7,12 @@ The map's photos are aligned as those of any survey. The other cameras of the ri
 of their own: they were where the map's camera was, turned by an angle that never changes.
 """
 
-from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from skyquilt.engine.clock import Clock, result_of
-from skyquilt.engine.folder import ADDED, STATE, THERMAL_FILE, stamp
+from skyquilt.engine.folder import ADDED, STATE, THERMAL_FILE, as_written, stamps
 from skyquilt.engine.pixel_cache import pixel_budget
 from skyquilt.engine.store import Store, digest
 from skyquilt.engine.workers import Threads
@@ -92,7 +91,11 @@ def _bands(made: FinishedMap, others: Sequence[Photo]) -> Generator[Event, None,
     clock = Clock(store=store, began=Clock.now(), workers=Threads(settings.running.threads))
     scene = result_of(scene_of(made.given, made.methods, settings, clock))
     key, former = _key(made, scene, others), made.result.metrics.get("bands")
-    if isinstance(former, dict) and former.get("key") == key and _whole(output, former):
+    if (
+        isinstance(former, dict)
+        and former.get("key") == key
+        and as_written(output, former.get("files"))
+    ):
         yield Note(text=f"{output} already contains these bands; nothing to do")
         yield made.result
         return
@@ -103,7 +106,7 @@ def _bands(made: FinishedMap, others: Sequence[Photo]) -> Generator[Event, None,
     bands, lost, made_files = yield from _drawn(made, scene, placed, clock, key)
     for name in {*ADDED} - {*made_files, THERMAL_FILE}:  # of an earlier run with other bands
         remove_file(output / name)
-    files = _stamps(output, made_files)
+    files = stamps(output, made_files)
     told = band_figures(bands, placed, lost)
     final = placed.final and len(lost) == len(placed.lost)
     figures = {"bands": told | {"key": key if final else "", "files": files}}
@@ -151,17 +154,6 @@ def _key(made: FinishedMap, scene: Scene, others: Sequence[Photo]) -> str:
         (FindBandRig(), place_bands, by_panels, BandsDrawing),
         __version__,
     )
-
-
-def _whole(output: Path, former: Mapping[str, Any]) -> bool:
-    """Whether the rasters of an earlier run are as it wrote them."""
-    files = former.get("files")
-    return isinstance(files, dict) and bool(files) and files == _stamps(output, files)
-
-
-def _stamps(output: Path, names: Iterable[str]) -> dict[str, str]:
-    """What tells each of these files from another one."""
-    return {name: stamp(output / name) for name in names}
 
 
 def _drawing(

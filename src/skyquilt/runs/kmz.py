@@ -96,7 +96,7 @@ def write_kmz(
         name = escape(f"{title} - {layer.title}")
         link = _link((0, 0, 0), pyramid, "")
         doc = f"{HEAD}<Document><name>{name}</name>{link}</Document></kml>\n"
-        archive.writestr("doc.kml", doc)
+        _put(archive, "doc.kml", doc)
         _write(archive, pyramid, (0, 0, 0))
 
 
@@ -110,7 +110,7 @@ def _write(archive: zipfile.ZipFile, pyramid: _Pyramid, at: Address) -> bool:
     kind, ending = ("image/png", "png") if clear else ("image/jpeg", "jpg")
     level, row, column = at
     name = f"{level}/{row}-{column}"
-    archive.writestr(f"{name}.{ending}", image_bytes(rgba, kind))
+    _put(archive, f"{name}.{ending}", image_bytes(rgba, kind))
     links = "".join(_link(c, pyramid, "../") for c in below)
     overlay = (
         f"<GroundOverlay><drawOrder>{level}</drawOrder>"
@@ -118,8 +118,15 @@ def _write(archive: zipfile.ZipFile, pyramid: _Pyramid, at: Address) -> bool:
         f"<LatLonBox>{_edges(pyramid.box(at))}</LatLonBox></GroundOverlay>"
     )
     region = _region(pyramid.box(at), 128 if level else 0)
-    archive.writestr(f"{name}.kml", f"{HEAD}<Document>{region}{overlay}{links}</Document></kml>\n")
+    _put(archive, f"{name}.kml", f"{HEAD}<Document>{region}{overlay}{links}</Document></kml>\n")
     return True
+
+
+def _put(archive: zipfile.ZipFile, name: str, content: str | bytes) -> None:
+    """Writes a file without the time of day, so that equal maps give equal archives."""
+    about = zipfile.ZipInfo(name)
+    about.external_attr = 0o600 << 16
+    archive.writestr(about, content)
 
 
 def _link(at: Address, pyramid: _Pyramid, up: str) -> str:

@@ -25,13 +25,14 @@ OVERLAYS = ("thermal_checkerboard.png", "thermal_false_colour.png", "thermal_alp
 """Overlays of both maps; the first image of a registration, side by side, is left out."""
 
 
-def write_overlays(output: Path, pictures: Sequence[NDArray[np.uint8]]) -> None:
-    """Writes RGB images in the order of `coregistration.files.OVERLAYS`."""
+def write_overlays(output: Path, pictures: Sequence[NDArray[np.uint8]]) -> tuple[str, ...]:
+    """Writes RGB images in the order of `coregistration.files.OVERLAYS`; returns their names."""
     for name, pixels in zip(OVERLAYS, pictures[1:], strict=True):
         done, data = cv2.imencode(".png", np.ascontiguousarray(pixels[..., ::-1]))
         assert done
         with whole_file(output / name, needed=len(data)) as file:
             file.write(data.tobytes())
+    return OVERLAYS
 
 
 def write_section(

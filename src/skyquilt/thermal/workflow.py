@@ -12,7 +12,7 @@ heights, which are the same in every spectral band, by day and night, in summer 
 no registration is accepted, the thermal map is placed by its own positions, and this is reported.
 """
 
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -26,6 +26,8 @@ from skyquilt.coregistration.pictures import Source
 from skyquilt.coregistration.rig import FindRig
 from skyquilt.coregistration.workflow import residual
 from skyquilt.engine.clock import Clock
+from skyquilt.engine.folder import THERMAL_FILE, as_written, stamps
+from skyquilt.engine.store import digest
 from skyquilt.errors import PhotoFailedError, RefusedError, UsageError
 from skyquilt.model.event import Event, Note, Result, StageFinished, StageStarted
 from skyquilt.model.photo import RejectedPhoto, Survey
@@ -39,8 +41,10 @@ from skyquilt.thermal.by_rig import draw_rigged, drift_of_rigged, rig_figures, r
 from skyquilt.thermal.page import write_overlays, write_section
 from skyquilt.thermal.routes import ROUTES, Joined, as_registration, join, opened, refuse_apart
 from skyquilt.typed import as_path, instance
+from skyquilt.version import __version__
 from skyquilt.workflows.flow import Scene
-from skyquilt.workflows.mosaic import FinishedMap, make_map
+from skyquilt.workflows.methods import methods_for
+from skyquilt.workflows.mosaic import FinishedMap, make_map, run_key
 from skyquilt.workflows.run_report import write_figures
 from skyquilt.workflows.survey_input import SurveyInput, read_input
 
@@ -103,14 +107,20 @@ def iter_thermal(
             text=f"no photo in {thermal} is known to be thermal; they are mapped unchanged",
             warning=True,
         )
+    key = _key((given, settings), (heats, heated), route)
     visual = yield from make_map(
         given, output, settings, overwrite=overwrite, rerun_from=rerun_from
     )
+    former = visual.result.metrics.get("thermal") or {}
+    if former.get("key") == key and as_written(output, former.get("files")):
+        yield Note(text=f"{output} already contains this thermal map; nothing to do")
+        yield visual.result
+        return
     refused: tuple[tuple[str, str], ...] = ()
     if route in ("auto", "rig"):
         began = Clock.now()
         yield StageStarted(stage="rig", total=0)
-        result = yield from _by_rig(visual, heats.survey, asked.picture)
+        result = yield from _by_rig(visual, heats.survey, asked.picture, key)
         yield _finished("rig", began)
         if isinstance(result, Result):
             yield result
@@ -126,7 +136,20 @@ def iter_thermal(
     heat = yield from make_map(
         heats, output / FOLDER, heated.changed(crs=crs), overwrite=overwrite, rerun_from=rerun_from
     )
-    yield from _joined(visual, heat, route, refused)
+    lost = len(heat.given.survey.photos) < len(heats.survey.photos)  # with them it is another map
+    yield from _joined(visual, heat, route, refused, "" if lost else key)
+
+
+def _key(
+    visual: tuple[SurveyInput, MosaicSettings],
+    thermal: tuple[SurveyInput, MosaicSettings],
+    route: str,
+) -> str:
+    """What a thermal map depends on: both surveys, how their maps are brought together, the
+    program.
+    """
+    maps = [run_key(given, wanted, methods_for(wanted)) for given, wanted in (visual, thermal)]
+    return digest(*maps, route, (join, rigged, draw_rigged), __version__)
 
 
 def _without_clips(heats: SurveyInput, folder: Path) -> tuple[SurveyInput, str]:
@@ -172,7 +195,11 @@ def _settings_of_both(asked: MosaicSettings) -> tuple[MosaicSettings, MosaicSett
 
 
 def _joined(
-    visual: FinishedMap, heat: FinishedMap, route: str, refused: tuple[tuple[str, str], ...]
+    visual: FinishedMap,
+    heat: FinishedMap,
+    route: str,
+    refused: tuple[tuple[str, str], ...],
+    key: str,
 ) -> Iterator[Event]:
     """thermal.tif by registration of the two maps, its report and figures."""
     output, began = visual.result.output, Clock.now()
@@ -194,9 +221,10 @@ def _joined(
     )
     joined = replace(joined, refused=(*refused, *joined.refused))
     tags = recorded_tags(heat.result.metrics)
-    resample_onto(output / "thermal.tif", a, b, joined.thermal_H_visual, tags)
+    resample_onto(output / THERMAL_FILE, a, b, joined.thermal_H_visual, tags)
     figures = {"thermal": _figures(joined, heat.result, b)}
-    _leave(output, overlays(a, b, as_registration(joined)), visual.result.metrics, figures)
+    pictures, told = overlays(a, b, as_registration(joined)), visual.result.metrics
+    _leave(output, pictures, told, figures, key, [f"{FOLDER}/mosaic.tif"])
     yield _finished("join", began)
     yield from (
         Note(text=f"registration by {name} was refused: {why}", warning=True)
@@ -218,7 +246,7 @@ def _finished(stage: str, began: tuple[float, float]) -> StageFinished:
 
 
 def _by_rig(
-    visual: FinishedMap, thermal: Survey, picture: PictureSettings
+    visual: FinishedMap, thermal: Survey, picture: PictureSettings, key: str
 ) -> Generator[Event, None, Result | RefusedRegistration]:
     """thermal.tif from the visual poses if one drone took both, or the reason why this is not
     possible. Frames that are lost meanwhile are left out.
@@ -235,10 +263,10 @@ def _by_rig(
     while True:
         try:
             exposure = drift_of_rigged(found, scene, visual.methods.drift, picture)
-            draw_rigged(output / "thermal.tif", found, scene, visual.methods.blend, exposure)
+            draw_rigged(output / THERMAL_FILE, found, scene, visual.methods.blend, exposure)
             break
         except PhotoFailedError as error:
-            found = found.without(error)
+            found, key = found.without(error), ""  # with all files it is another map
             yield Note(text=f"{error.photo} is left out: {error.reason}", warning=True)
         if len(found.alignment.poses) < FindRig.minimum:
             return RefusedRegistration(
@@ -249,8 +277,8 @@ def _by_rig(
     same = Registration(model="identity", b_H_a=np.eye(3), px_a=none, px_b=none)
     figures = {"thermal": rig_figures(found, thermal)}
     figures["thermal"] |= value_figures(found.photos, exposure, picture)
-    pictures = overlays(opened(output / "mosaic.tif"), opened(output / "thermal.tif"), same)
-    _leave(output, pictures, metrics, figures)
+    pictures = overlays(opened(output / "mosaic.tif"), opened(output / THERMAL_FILE), same)
+    _leave(output, pictures, metrics, figures, key)
     return Result(output=output, metrics={**metrics, **figures})
 
 
@@ -259,10 +287,15 @@ def _leave(
     pictures: list[NDArray[np.uint8]],
     visual: Mapping[str, Any],
     figures: dict[str, Any],
+    key: str,
+    more: Sequence[str] = (),
 ) -> None:
-    """Writes the overlays, the report's section, and finally the figures."""
-    write_overlays(output, pictures)
-    write_section(output, opened(output / "thermal.tif"), pictures, figures["thermal"])
+    """Writes the overlays, the report's section, and finally the figures; with these the key of the
+    thermal map, and what its files (`more`: beside those written here) are known by.
+    """
+    names = write_overlays(output, pictures)
+    write_section(output, opened(output / THERMAL_FILE), pictures, figures["thermal"])
+    figures["thermal"] |= {"key": key, "files": stamps(output, [THERMAL_FILE, *names, *more])}
     write_figures(output, {**visual, **figures})
 
 

@@ -231,7 +231,9 @@ def check_input(given: SurveyInput, output: Path, settings: MosaicSettings) -> S
             f"{output} contains the photos; choose another folder for the results, such as"
             f" {output / 'map'}"
         )
-    frame = frame_of(given.survey.photos, given.control, settings)
+    # frames of clips, and what they report, are not known yet
+    early = settings.changed(vertical_datum=None) if given.survey.clips else settings
+    frame = frame_of(given.survey.photos, given.control, early)
     _check_exists("boundary", settings.picture.boundary)
     if settings.picture.boundary is not None and not given.survey.clips:
         if frame.crs is None:
