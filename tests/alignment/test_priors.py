@@ -99,6 +99,8 @@ def test_a_crs_asked_for():
         ("EPSG:4326", "not projected in metres"),
         ("EPSG:2263", "not projected in metres"),
         ("EPSG:4978", "not projected"),
+        ("EPSG:5773", "not projected"),
+        ("EPSG:32630+5773", "what heights count from .* horizontal part, EPSG:32630"),
     ],
 )
 def test_a_crs_that_will_not_do(crs, words):

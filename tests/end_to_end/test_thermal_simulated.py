@@ -16,6 +16,7 @@ from skyquilt.simulate import FlightSettings, simulate
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, Route, Thermal
 from skyquilt.simulate.weather import Weather
+from skyquilt.thermal import workflow
 from skyquilt.thermal.workflow import iter_thermal
 from tests.end_to_end.conftest import relabel
 
@@ -104,6 +105,22 @@ def test_every_route_brings_the_thermal_map_to_its_place(flights, output, route,
 def test_positions_alone_are_a_route_too_and_a_worse_one(flights, output):
     joined(flights, output, "positions")
     assert error_gsd(flights, output) > 5
+
+
+@pytest.mark.slow
+def test_the_same_command_again_joins_nothing(flights, output, monkeypatch):
+    told = joined(flights, output, "maps")
+    before = {p: p.stat().st_mtime_ns for p in output.glob("*.*")}
+
+    def again(*_args, **_more):
+        raise AssertionError("the maps are joined again")
+
+    monkeypatch.setattr(workflow, "join", again)
+    assert joined(flights, output, "maps") == told
+    assert {p: p.stat().st_mtime_ns for p in output.glob("*.*")} == before
+    (output / "thermal.tif").write_bytes(b"")
+    with pytest.raises(AssertionError, match="joined again"):
+        joined(flights, output, "maps")
 
 
 @pytest.mark.slow

@@ -15,7 +15,10 @@ from typer.testing import CliRunner
 
 from skyquilt.cli import app as commands
 from skyquilt.errors import OutputError, SideFileError, UsageError
+from skyquilt.raster import RasterSpec, write_array
+from skyquilt.raster.map_source import FileSource
 from skyquilt.runs.export import WHAT, Wanted, export
+from skyquilt.runs.grid import grid_of
 from skyquilt.runs.opened import open_run
 
 
@@ -105,6 +108,8 @@ def test_web_tiles_and_mbtiles_and_kmz_show_the_same_ground(finished, exported):
     assert abs(west - lon) < 1e-6 and abs(north - lat) < 1e-6
     with zipfile.ZipFile(folder / "mosaic.kmz") as archive:
         assert archive.testzip() is None and archive.namelist()[0] == "doc.kml"
+        # equal maps give equal files
+        assert {i.date_time for i in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
 
 
 def test_footprints_are_those_of_the_run(finished, exported):
@@ -136,10 +141,50 @@ def test_memory_does_not_grow_with_the_part(finished, tmp_path, monkeypatch):
     assert np.mean(np.abs(pixels[0] - pixels[1])[:, both]) < 1.5
 
 
+@pytest.mark.parametrize(("vertical", "word"), [(4979, "ellipsoidal"), (5773, "EGM96")])
+def test_heights_keep_their_place_and_what_they_count_from(vertical, word, tmp_path):
+    """A map of heights above the ellipsoid has a coordinate system of three dimensions, which
+    pictures cannot state.
+    """
+    rng = np.random.default_rng(1)
+    z = (480 + rng.normal(0, 3, (64, 80))).astype(np.float32)
+    place = {"width": 80, "height": 64, "transform": (0.5, 0, 446300, 0, -0.5, 5160900)}
+    heights = RasterSpec(
+        **place, bands=1, dtype="float32", crs="EPSG:32633", vertical=vertical, nodata=float("nan"),
+        band_names=("height",), band_units=("m",),
+    )  # fmt: skip
+    colours = RasterSpec(**place, bands=3, dtype="uint8", crs="EPSG:32633", mask=True)
+    write_array(tmp_path / "dsm.tif", z, heights)
+    write_array(tmp_path / "mosaic.tif", np.zeros((64, 80, 3), np.uint8), colours)
+    (tmp_path / "metrics.json").write_text(
+        json.dumps({"vertical_datum": {4979: "ellipsoid", 5773: "egm96"}[vertical]})
+    )
+    wanted = Wanted(what=("heights", "png"), layer="heights")
+    list(export(tmp_path, wanted, tmp_path / "out"))
+    with rasterio.open(tmp_path / "out" / "heights.tif") as ours:
+        assert np.array_equal(ours.read(1), z) and word in ours.crs.to_wkt()
+        assert tuple(ours.bounds) == (446300, 5160868, 446340, 5160900)
+        assert ours.descriptions == ("height",) and ours.units == ("m",)
+    with rasterio.open(tmp_path / "out" / "heights.png") as picture:
+        assert picture.crs.to_epsg() == 32633
+
+
+def test_pixels_are_as_large_where_axes_count_in_feet(finished):
+    source = FileSource(path=finished.output / "mosaic.tif")
+    feet, metres = (
+        grid_of(source, None, f"+proj=utm +zone=33 +datum=WGS84 +units={unit}", 0.5)
+        for unit in ("us-ft", "m")
+    )
+    assert feet.step == pytest.approx(0.5 * 3937 / 1200)
+    assert abs(feet.width - metres.width) <= 1 and abs(feet.height - metres.height) <= 1
+
+
 @pytest.mark.parametrize(
     "wanted",
     [{"what": ("gif",)}, {"what": ()}, {"what": ("png",), "gsd_m": 0.0},
-     {"what": ("png",), "crs": "EPSG:0"}, {"what": ("png",), "bounds": (1.0, 1.0, 0.0, 2.0)}],
+     {"what": ("png",), "crs": "EPSG:0"}, {"what": ("png",), "bounds": (1.0, 1.0, 0.0, 2.0)},
+     {"what": ("png",), "crs": "EPSG:4979"}, {"what": ("png",), "crs": "EPSG:4978"},
+     {"what": ("tif",), "crs": "EPSG:5773"}, {"what": ("tif",), "crs": "EPSG:4326+5773"}],
 )  # fmt: skip
 def test_what_cannot_be_exported_is_refused(wanted):
     with pytest.raises(UsageError):

@@ -104,13 +104,7 @@ def checked_crs(crs: str) -> str:
     Raises:
         UsageError: it is unknown, or suits no map.
     """
-    try:
-        parsed = CRS.from_user_input(crs)
-    except CRSError as error:
-        raise UsageError(
-            f"--crs '{plain(crs, 80)}' is not a coordinate system known to PROJ; try e.g."
-            " EPSG:32633"
-        ) from error
+    parsed = horizontal_crs(crs)
     if not parsed.is_projected or any(
         axis.unit_name not in ("metre", "meter") for axis in parsed.axis_info[:2]
     ):
@@ -118,6 +112,34 @@ def checked_crs(crs: str) -> str:
             f"--crs {crs!r} ({parsed.name}) is not projected in metres; a mosaic needs one that is"
         )
     return crs
+
+
+def horizontal_crs(crs: str) -> CRS:
+    """The coordinate system that `--crs` names.
+
+    Raises:
+        UsageError: it is unknown, is none of maps, or says what heights count from as well.
+    """
+    try:
+        parsed = CRS.from_user_input(crs)
+    except CRSError as error:
+        raise UsageError(
+            f"--crs '{plain(crs, 80)}' is not a coordinate system known to PROJ; try e.g."
+            " EPSG:32633"
+        ) from error
+    shown = f"--crs '{plain(crs, 80)}' ({plain(parsed.name, 80)})"
+    if not (parsed.is_projected or parsed.is_geographic):
+        raise UsageError(
+            f"{shown} is not projected or geographic, as that of a map is; try e.g. EPSG:32633"
+        )
+    if parsed.is_compound or len(parsed.axis_info) > 2:
+        flat = parsed.sub_crs_list[0] if parsed.is_compound else parsed.to_2d()
+        code = flat.to_authority()
+        raise UsageError(
+            f"{shown} says what heights count from as well, which --crs does not change; give its"
+            f" horizontal part{', ' + ':'.join(code) if code else ''}"
+        )
+    return parsed
 
 
 def stretch(crs: str, latitude: float, longitude: float) -> NDArray[np.float64]:

@@ -75,19 +75,22 @@ def composer(
     )
 
 
+def not_jpeg(dtype: np.dtype[Any] | str, bands: int) -> str:
+    """Why JPEG does not hold pixels of a kind; empty where it does."""
+    if np.dtype(dtype) == np.uint8 and bands in (1, 3):
+        return ""
+    return f"--compress jpeg is for 8-bit pictures; these photos are {dtype}, {bands} bands"
+
+
 def mosaic_spec(
     compose: Composer, alignment: Alignment, settings: OutputSettings, unit: str
 ) -> RasterSpec:
     """How mosaic.tif is written."""
-    picture = compose.dtype == np.uint8
-    compress = cast(Compression, settings.compress)
+    compress, unfit = cast(Compression, settings.compress), not_jpeg(compose.dtype, compose.bands)
     if settings.compress == "auto":
-        compress = "jpeg" if picture and compose.bands in (1, 3) else "zstd"
-    if compress == "jpeg" and not (picture and compose.bands in (1, 3)):
-        raise UsageError(
-            f"--compress jpeg is for 8-bit pictures; these photos are {compose.dtype},"
-            f" {compose.bands} bands"
-        )
+        compress = "zstd" if unfit else "jpeg"
+    if compress == "jpeg" and unfit:
+        raise UsageError(unfit)
     real = compose.dtype.kind == "f"
     return RasterSpec(
         width=compose.grid.width,

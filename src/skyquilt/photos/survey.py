@@ -191,8 +191,9 @@ def read_survey(
     side = geo or found.geo
     if side and photos and not (films and is_timed(side)):
         photos, notes = apply_positions(photos, side, clock_offset)
-    if cameras:
-        photos, more = apply_cameras(photos, read_cameras_json(cameras), file=cameras)
+    calibrated = read_cameras_json(cameras) if cameras else {}
+    if cameras and not films:  # those of clips are known with their frames
+        photos, more = apply_cameras(photos, calibrated, file=cameras)
         notes = (*notes, *more)
     photos, greyed = _in_colour(_with_editors(photos))
     photos, implausible = placed_plausibly(photos)

@@ -67,6 +67,8 @@ class About:
     """Its own tags."""
     units: tuple[str, ...] = ()
     """Unit of each band; empty where none is stated."""
+    names: tuple[str, ...] = ()
+    """Name of each band; empty where none is stated."""
 
 
 class MapSource(Protocol):
@@ -197,7 +199,10 @@ class FileSource:
             with self.opened() as raster:
                 bands = 3 if raster.count >= 3 else 1
                 system = raster.crs
-                units = tuple(u or "" for u in raster.units[:bands])
+                units, names = (
+                    tuple(word or "" for word in words[:bands])
+                    for words in (raster.units, raster.descriptions)
+                )
                 self._known["about"] = About(
                     crs=plane(system.to_string()) if system else "",
                     bounds=tuple(raster.bounds),
@@ -206,6 +211,7 @@ class FileSource:
                     resolution=float(raster.res[0]),
                     tags={k: str(v) for k, v in raster.tags().items() if k != "AREA_OR_POINT"},
                     units=units if any(units) else (),
+                    names=names if any(names) else (),
                 )
         return self._known["about"]
 
@@ -270,9 +276,9 @@ def plane(crs: str) -> str:
     from pyproj import CRS
 
     known = CRS(crs)
-    if not known.is_compound:
+    if not known.is_compound and len(known.axis_info) < 3:
         return crs
-    flat = known.sub_crs_list[0]
+    flat = known.sub_crs_list[0] if known.is_compound else known.to_2d()
     code = flat.to_epsg()
     return f"EPSG:{code}" if code else str(flat.to_wkt())
 

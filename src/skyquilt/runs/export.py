@@ -14,7 +14,7 @@ import numpy as np
 
 from skyquilt.engine.folder import EXPORTS, changed, make_folder
 from skyquilt.errors import SideFileError, UsageError
-from skyquilt.outside import plain, put_in_place, read_bounded, remove_file, remove_folder
+from skyquilt.outside import put_in_place, read_bounded, remove_file, remove_folder
 from skyquilt.raster import CogWriter, RasterSpec
 from skyquilt.raster.atomic import mended, write_text
 from skyquilt.raster.geopackage import write_polygons
@@ -73,7 +73,9 @@ class Wanted:
         ):
             raise UsageError("--bounds is west,south,east,north, and has no area here")
         if self.crs is not None:
-            _check_crs(self.crs)
+            from skyquilt.alignment.priors import horizontal_crs  # PROJ, only where it is needed
+
+            horizontal_crs(self.crs)
 
 
 def parse_what(text: str) -> tuple[str, ...]:
@@ -196,6 +198,7 @@ def write_tif(
         mask=not real,
         overviews="average" if real or colours else "nearest",
         tags=about.tags,
+        band_names=about.names,
         band_units=about.units,
     )
     some = False
@@ -273,15 +276,3 @@ def _footprints(folder: Path, wanted: Wanted, target: Path) -> Export:
     return Export(
         path=path, note=f"{write_polygons(path, 'footprints', rings, crs=crs or None)} photos"
     )
-
-
-def _check_crs(text: str) -> None:
-    from pyproj import CRS
-    from pyproj.exceptions import CRSError
-
-    try:
-        CRS(text)
-    except CRSError as error:
-        raise UsageError(
-            f"--crs '{plain(text, 80)}' is no coordinate system, such as EPSG:32633"
-        ) from error

@@ -3,9 +3,13 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from skyquilt.errors import UsageError
 from skyquilt.raster.map_source import Bounds, MapSource, between
+
+if TYPE_CHECKING:
+    from pyproj import CRS
 
 METRES_PER_DEGREE = 111_320.0
 """Length of a degree of latitude."""
@@ -58,6 +62,13 @@ class ExportGrid:
             yield column, min(BLOCK, self.width - column)
 
 
+def _metres_per_unit(crs: "CRS") -> float:
+    """Length in m of a unit of a coordinate system's axes: of a degree, a metre, a foot."""
+    if crs.is_geographic:
+        return METRES_PER_DEGREE
+    return float(crs.axis_info[0].unit_conversion_factor)
+
+
 def grid_of(
     source: MapSource, bounds: Bounds | None, crs: str | None, gsd_m: float | None
 ) -> ExportGrid:
@@ -78,10 +89,10 @@ def grid_of(
     own = target == source.crs or (crs is not None and CRS(crs) == CRS(source.crs))
     if not own:
         extent = between(source.crs, target).transform_bounds(*extent)
-    degrees = bool(target) and CRS(target).is_geographic
+    unit = 1.0 if not target else _metres_per_unit(CRS(target))
     around = METRES_PER_DEGREE if source.crs and CRS(source.crs).is_geographic else 1.0
     metres = gsd_m or native * around
-    step = metres / (METRES_PER_DEGREE if degrees else 1.0)
+    step = metres / unit
     west, south, east, north = bounds or extent
     west, south, east, north = (
         max(west, extent[0]),

@@ -11,6 +11,7 @@ from skyquilt.errors import NoPhotosError, UnreadablePhotoError
 from skyquilt.model.clip import ChosenFrames, Clip, Looks, Track
 from skyquilt.model.event import Note
 from skyquilt.model.photo import Photo, RejectedPhoto
+from skyquilt.photos.cameras_json import apply_cameras, read_cameras_json
 from skyquilt.photos.clips import after_others, frames_of
 from skyquilt.photos.frame_files import frame_jpeg
 from skyquilt.photos.survey import placed_plausibly
@@ -88,6 +89,10 @@ def with_frames(given: SurveyInput, settings: InputSettings, store: Store) -> St
         reasons = "; ".join(f"{r.name}: {r.reason}" for r in rejected)
         raise NoPhotosError(f"no clip has a frame that can be used ({reasons})")
     every, more = placed_plausibly([*given.survey.photos, *photos])
+    if settings.cameras is not None:
+        known = read_cameras_json(settings.cameras)
+        every, lacking = apply_cameras(every, known, file=settings.cameras)
+        more = (*more, *lacking)
     survey = replace(
         given.survey,
         photos=every,

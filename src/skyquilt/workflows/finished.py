@@ -9,7 +9,7 @@ import numpy as np
 
 from skyquilt.engine.store import Store, digest
 from skyquilt.errors import OutputError
-from skyquilt.model.photo import Photo
+from skyquilt.model.photo import ControlPoint, Photo
 from skyquilt.model.poses import Alignment, MapFrame
 from skyquilt.model.raster import Grid
 from skyquilt.ortho.earlier import EarlierMap
@@ -28,6 +28,8 @@ class Finished:
 
     recipe: str
     """Settings and methods that it was made with (`recipe_of`)."""
+    control: str
+    """Its control points, with their sightings (`control_key`)."""
     photos: tuple[str, ...]
     """Each photo that took part, by content and metadata (`photo_key`)."""
     names: tuple[str, ...]
@@ -72,9 +74,10 @@ class Earlier:
                 " have changed, and --add only adds; use --overwrite instead"
             )
 
-    def complete(self, photos: Sequence[Photo]) -> bool:
-        """Whether all its photos are among these."""
-        return len(self._where(photos)) == len(self.finished.photos)
+    def complete(self, photos: Sequence[Photo], control: Sequence[ControlPoint]) -> bool:
+        """Whether all its photos are among these, and the same control points hold it."""
+        held = self.finished.control == control_key(control)
+        return held and len(self._where(photos)) == len(self.finished.photos)
 
     def alignment_of(self, photos: Sequence[Photo]) -> Alignment:
         """Its poses by the numbers of the photos now."""
@@ -105,6 +108,11 @@ class Earlier:
         return {i: n for i, n in found if n is not None}
 
 
+def control_key(control: Sequence[ControlPoint]) -> str:
+    """Control points with their sightings, of which those on photos that are not there are none."""
+    return digest(list(control))
+
+
 def stamps(output: Path) -> tuple[tuple[int, ...], ...]:
     """Size and time of a run's rasters: whether they are still those that were written."""
     found = (output / name for name in FILES)
@@ -123,7 +131,7 @@ def earlier_map(store: Store, recipe: str, output: Path) -> Earlier | None:
         return None
     if found.recipe != recipe:
         raise OutputError(
-            f"the map in {output} was made with other settings, control points or another version,"
+            f"the map in {output} was made with other settings or another version,"
             " and --add needs the same; use the same options, or --overwrite instead of --add"
         )
     alignment = store.get("alignment", found.alignment)

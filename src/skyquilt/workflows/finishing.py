@@ -9,7 +9,7 @@ from skyquilt.ortho.earlier import same_pose
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.orthomosaic import used_photos
 from skyquilt.report.tables import added_sentence
-from skyquilt.workflows.finished import Finished, stamps
+from skyquilt.workflows.finished import Finished, control_key, stamps
 from skyquilt.workflows.flow import AlignedPhotos, DrawnMap
 from skyquilt.workflows.keys import photo_key
 
@@ -20,6 +20,7 @@ def finished(
     """The record of a map in `output`; its results are in the store."""
     return Finished(
         recipe=recipe,
+        control=control_key(aligned.given.control),
         photos=tuple(photo_key(p) for p in aligned.photos),
         names=tuple(p.name for p in aligned.photos),
         frame=aligned.frame,

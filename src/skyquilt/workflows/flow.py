@@ -170,7 +170,7 @@ def align_photos(
     found = of_one_kind(found)
     pixels = PixelsInUse(found.photos, found.number, cache)
     grey = GreyPictures(found.photos, pixels, store)
-    if earlier is not None and not earlier.complete(found.photos):
+    if earlier is not None and not earlier.complete(found.photos, given.control):
         earlier = None
     if earlier is not None:
         frame = earlier.finished.frame

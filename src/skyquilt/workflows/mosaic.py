@@ -318,12 +318,12 @@ def run_key(given: SurveyInput, settings: MosaicSettings, methods: Methods) -> s
         (c.name, c.digest, c.track and c.track.digest, c.start and c.start.isoformat(), c.focal)
         for c in given.survey.clips
     ]
-    return digest(photos, films, recipe_of(given, settings, methods))
+    return digest(photos, films, list(given.control), recipe_of(given, settings, methods))
 
 
 def recipe_of(given: SurveyInput, settings: MosaicSettings, methods: Methods) -> str:
-    """What a map is made with beside its photos: settings that affect results, side files, control
-    points, the methods, and the constants of all code used.
+    """What a map is made with beside photos and control points: settings that affect results, side
+    files, the methods, and the constants of all code used.
     """
     shaping = {
         k: v
@@ -332,11 +332,12 @@ def recipe_of(given: SurveyInput, settings: MosaicSettings, methods: Methods) ->
     }
     files = (settings.picture.boundary, settings.input.distances, Path(settings.input.sequence))
     side = [content_digest(p) for p in files if p is not None and p.is_file()]
-    if given.survey.clips:  # control points are read when the frames are known
+    if given.survey.clips:  # these are read when the frames are known
         gcp = given.control_file(settings.input.gcp)
-        side += [content_digest(gcp)] if gcp is not None and gcp.is_file() else []
+        named = (gcp, settings.input.cameras)
+        side += [content_digest(p) for p in named if p is not None and p.is_file()]
         side.append(digest(frame_methods(settings.input)))
-    return digest(list(given.control), shaping, side, methods, make_map, __version__)
+    return digest(shaping, side, methods, make_map, __version__)
 
 
 def _measured(

@@ -17,6 +17,7 @@ from skyquilt.model.photo import (
     Survey,
 )
 from skyquilt.model.poses import MapFrame
+from skyquilt.ortho.orthomosaic import not_jpeg
 from skyquilt.outside import same_folder
 from skyquilt.photos.detector_faults import Repair
 from skyquilt.photos.distances import read_distances
@@ -244,8 +245,22 @@ def check_input(given: SurveyInput, output: Path, settings: MosaicSettings) -> S
         from skyquilt.raster.boundary import read_boundary
 
         read_boundary(settings.picture.boundary, frame.crs)
+    _check_jpeg(given, settings.output.compress)
     notes = (*given.survey.notes, *_idle(given, settings))
     return replace(given, survey=replace(given.survey, notes=notes))
+
+
+def _check_jpeg(given: SurveyInput, compress: str) -> None:
+    """Refuses JPEG for photos of which none can be stored so.
+
+    Raises:
+        UsageError: there are none with 8 bits in one or three bands.
+    """
+    if compress != "jpeg" or given.survey.clips or given.clips:
+        return
+    whys = [not_jpeg(p.dtype, p.channels) for p in given.survey.photos]
+    if whys and all(whys):
+        raise UsageError(whys[0])
 
 
 def _idle(given: SurveyInput, settings: MosaicSettings) -> Iterator[str]:
