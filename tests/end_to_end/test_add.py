@@ -67,6 +67,40 @@ def test_other_settings_are_refused_and_the_map_stays(mosaic, eight):
     assert mosaic(photos, "--add").made().metrics["photos_used"] == 9
 
 
+def test_control_points_seen_in_new_photos_hold_the_map_too(mosaic, photos, flight):
+    """One list of control points for the whole survey: of the first photos it names but some."""
+    listed = flight / "gcp_list.txt"
+    later = named(photos)[6:]
+    for path in later:
+        path.unlink()
+    mosaic(photos, "--gcp", listed).made()
+    for path in later:
+        shutil.copy(flight / "photos" / path.name, photos)
+    told = mosaic(photos, "--gcp", listed, "--add").made()
+    assert "all of it is made anew" in told.err
+    whole = mosaic(photos, "--gcp", listed, output=told.output.with_name("whole")).made()
+    for name in ("photos_used", "control", "reprojection_error_px"):
+        assert told.metrics[name] == whole.metrics[name]
+    assert len(told.metrics["control"]) >= 3
+
+
+def test_the_zero_of_heights_is_that_of_all_photos(mosaic, photos, flight):
+    """Three photos tell the take-off point's height to some metres only."""
+    later, datum = named(photos)[3:], ("--vertical-datum", "egm96")
+    for path in later:
+        path.unlink()
+    mosaic(photos, *datum).made()
+    for path in later:
+        shutil.copy(flight / "photos" / path.name, photos)
+    told = mosaic(photos, *datum, "--add").made()
+    whole = mosaic(photos, *datum, output=told.output.with_name("whole")).made()
+    heights = []
+    for output in (told.output, whole.output):
+        with rasterio.open(output / "dsm.tif") as file:
+            heights.append(float(np.nanmedian(file.read(1))))
+    assert heights[0] == pytest.approx(heights[1], abs=0.5)
+
+
 def test_photos_that_are_gone_are_named(mosaic, eight):
     photos, last = eight
     shutil.copy(last, photos)

@@ -56,6 +56,18 @@ def test_a_clip_with_telemetry(flight, tmp_path):
     assert again.metrics["seconds"] == result.metrics["seconds"]
 
 
+def test_what_is_said_of_frames_is_asked_when_they_are_known(flight, tmp_path):
+    """Calibrations by name of the frames' camera, and a zero that their positions must allow."""
+    clip = flight[0] / "video" / "FLIGHT.MP4"
+    quick = skyquilt.MosaicSettings(surface="ties", gsd_cm=30.0)
+    skyquilt.mosaic(clip, tmp_path / "first", quick)
+    calibrated = tmp_path / "first" / "cameras.json"
+    asked = quick.changed(cameras=calibrated, vertical_datum="egm96")
+    told = skyquilt.mosaic(clip, tmp_path / "map", asked).metrics
+    assert told["vertical_datum"] == "egm96"
+    assert {c["focal"]["source"] for c in told["cameras"].values()} == {"calibrated"}
+
+
 def test_a_clip_without_positions(flight, tmp_path):
     folder, frames = flight
     clip = tmp_path / "FLIGHT.MP4"

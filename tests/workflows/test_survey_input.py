@@ -1,5 +1,12 @@
+from dataclasses import replace
+
+import pytest
+
+from skyquilt.errors import UsageError
 from skyquilt.model.photo import Survey
-from skyquilt.workflows.survey_input import SurveyInput
+from skyquilt.settings import MosaicSettings
+from skyquilt.workflows.survey_input import SurveyInput, check_input
+from tests.alignment.surveys import photo
 
 
 def given(source):
@@ -19,6 +26,17 @@ def test_control_points_beside_or_among_what_is_given(tmp_path):
     assert given(folders).control_file(tmp_path / "other.txt") == tmp_path / "other.txt"
     (folders[1] / "gcp_list.txt").write_text("EPSG:4326\n")  # which one is meant?
     assert given(folders).control_file(None) is None
+
+
+def test_jpeg_of_more_than_8_bits_is_refused_before_anything_is_made(tmp_path):
+    jpeg, deep = MosaicSettings(compress="jpeg"), replace(photo(), dtype="uint16", channels=1)
+    for photos, refused in (((deep,), True), ((deep, photo()), False)):
+        there = replace(given([]), survey=Survey(photos=photos))
+        if refused:
+            with pytest.raises(UsageError, match="jpeg is for 8-bit pictures; .* uint16, 1 bands"):
+                check_input(there, tmp_path, jpeg)
+        else:  # the map is of the kind that most photos are of
+            check_input(there, tmp_path, jpeg)
 
 
 def test_titles_count_what_is_given(tmp_path):

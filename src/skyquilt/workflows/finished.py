@@ -20,6 +20,10 @@ from skyquilt.workflows.keys import photo_key
 
 STAGE, NAME = "finished", "map"
 """Where the record is in the store."""
+LEVEL_M = 0.5
+"""A map goes on where the take-off point, as a median of all photos tells it, lies no further in m
+from where it lay by the first ones: of a few photos it is metres off.
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -74,10 +78,16 @@ class Earlier:
                 " have changed, and --add only adds; use --overwrite instead"
             )
 
-    def complete(self, photos: Sequence[Photo], control: Sequence[ControlPoint]) -> bool:
-        """Whether all its photos are among these, and the same control points hold it."""
+    def complete(
+        self, photos: Sequence[Photo], control: Sequence[ControlPoint], frame: MapFrame
+    ) -> bool:
+        """Whether all its photos are among these, the same control points hold it, and its heights
+        count from where they do by the `frame` of all photos.
+        """
         held = self.finished.control == control_key(control)
-        return held and len(self._where(photos)) == len(self.finished.photos)
+        zeros = [f.takeoff_m or 0.0 for f in (self.finished.frame, frame)]
+        level = abs(zeros[0] - zeros[1]) <= LEVEL_M
+        return held and level and len(self._where(photos)) == len(self.finished.photos)
 
     def alignment_of(self, photos: Sequence[Photo]) -> Alignment:
         """Its poses by the numbers of the photos now."""

@@ -170,12 +170,11 @@ def align_photos(
     found = of_one_kind(found)
     pixels = PixelsInUse(found.photos, found.number, cache)
     grey = GreyPictures(found.photos, pixels, store)
-    if earlier is not None and not earlier.complete(found.photos, given.control):
+    frame = frame_of(found.photos, given.control, settings)
+    if earlier is not None and not earlier.complete(found.photos, given.control, frame):
         earlier = None
     if earlier is not None:
         frame = earlier.finished.frame
-    else:
-        frame = frame_of(found.photos, given.control, settings)
     reported = priors(found.photos, frame)
     linking = _links(found, frame, reported, grey, methods, store, workers)
     found, links = yield from clock.stage("links", linking)
