@@ -22,8 +22,8 @@ def command(
     layer: Annotated[
         str,
         typer.Option(
-            help="Raster to export: mosaic, thermal, infrared, ndvi, ndre, gndvi, heights, hillshade,"
-            " ground, views, provenance."
+            help="Raster to export: mosaic, thermal, infrared, ndvi, ndre, gndvi, heights,"
+            " hillshade, ground, views, provenance."
         ),
     ] = "mosaic",
     bounds: Annotated[
