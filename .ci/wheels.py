@@ -2,7 +2,7 @@
 machine has, and uses it there: a simulated flight is mapped, and shown by `view` and `live`. For
 Windows and macOS it only looks whether every package has a wheel.
 
-python .ci/wheels.py
+python .ci/wheels.py [--ends]: with `--ends`, of the Pythons only the oldest and the newest.
 """
 
 import os
@@ -97,7 +97,10 @@ def found(platform: str, minor: int, wheel: Path, folder: Path) -> None:
 
 def main() -> None:
     """Prints a line for each version of Python."""
-    there = pythons()
+    ends = "--ends" in sys.argv[1:]
+    there, minors = pythons(), MINORS[:: len(MINORS) - 1] if ends else MINORS
+    if ends:
+        there = {version: there[version] for version in (min(there), max(there))}
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         words = ["-m", "pip", "--disable-pip-version-check", "wheel", "--quiet", "--no-deps"]
@@ -107,7 +110,7 @@ def main() -> None:
         for minor in TRIED:
             version = (3, minor)
             if version not in there:
-                sys.stdout.write(f"Python 3.{minor}: not on this machine\n")
+                sys.stdout.write(f"Python 3.{minor}: not on this machine, or not tried\n")
                 continue
             place = folder / f"3.{minor}"
             place.mkdir()
@@ -116,9 +119,10 @@ def main() -> None:
             sys.stdout.flush()
             shutil.rmtree(place)
         for platform in PLATFORMS:
-            for minor in MINORS:
+            for minor in minors:
                 found(platform, minor, wheel, folder)
-            sys.stdout.write(f"{platform}: wheels for Python 3.{MINORS[0]} to 3.{MINORS[-1]}\n")
+            told = f" {'and' if ends else 'to'} 3.".join((str(minors[0]), str(minors[-1])))
+            sys.stdout.write(f"{platform}: wheels for Python 3.{told}\n")
 
 
 if __name__ == "__main__":

@@ -98,11 +98,12 @@ BESIDE = (
     {},
     {"method": "image", "levelled": False},
     {"method": "image", "estimator": "ncc"},
-    {"method": "hybrid", "optimiser": "anneal"},
+    pytest.param({"method": "hybrid", "optimiser": "anneal"}, marks=pytest.mark.long),
     {"method": "pose", "repair": False},
     {"blend": "first"},
     {"compress": "deflate"},
-    *({"method": name} for name in METHODS if name not in ("auto", "bundle")),
+    *({"method": name} for name in METHODS if name not in ("auto", "bundle", "flightline")),
+    pytest.param({"method": "flightline"}, marks=pytest.mark.long),
 )
 LATENT = {("auto", "height_m"), ("image", "height_m"), ("image", "relief_m")}
 """Of use where photos say less than these do."""

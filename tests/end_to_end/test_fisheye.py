@@ -99,7 +99,7 @@ def test_photos_are_added_to_its_map(mosaic, wide, tmp_path):
     assert [c["field"] for c in m["metadata_conflicts"]] == ["focal"]  # stated 15 % off
 
 
-@pytest.mark.parametrize("method", ["image", "flightline"])
+@pytest.mark.parametrize("method", ["image", pytest.param("flightline", marks=pytest.mark.long)])
 def test_mosaics_in_the_plane_find_it_too(mosaic, wide, method):
     run = mosaic(wide / "photos", "--method", method).made()
     assert sum(run.metrics["blocks"]) == 12

@@ -71,7 +71,9 @@ def off_m(output, flight):
     return stretch.sum() / (a**2).sum() * a @ (u @ v) - b
 
 
-@pytest.mark.parametrize("told", [True, False], ids=["angles", "no angles"])
+@pytest.mark.parametrize(
+    "told", [True, pytest.param(False, marks=pytest.mark.long)], ids=["angles", "no angles"]
+)
 def test_all_photos_of_five_cameras_are_placed_in_one_block(flight, told, tmp_path):
     """Compared with the nearest photos only, 17 and 4 of the 60 lay in the largest block."""
     photos = flight / "photos"

@@ -89,7 +89,10 @@ def error_gsd(flights, output):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("route", "most"),
-    [("maps", 2.0), pytest.param("pairs", 2.5, marks=pytest.mark.long), ("heights", 2.0)],
+    [
+        ("maps", 2.0),
+        *(pytest.param(*r, marks=pytest.mark.long) for r in (("pairs", 2.5), ("heights", 2.0))),
+    ],
 )
 def test_every_route_brings_the_thermal_map_to_its_place(flights, output, route, most):
     told = joined(flights, output, route)

@@ -495,7 +495,7 @@ def test_absurd_heights_cost_little(tmp_path):
 @pytest.mark.slow
 def test_many_of_the_largest_images_at_once(site):
     """Two are drawn at a time, and their memory is given back; too large ones cost nothing."""
-    many = 24
+    many = 16
     side = int(MOST_PIXELS**0.5)
     query = f"{MAP}&BBOX={box(site)}&LAYERS=mosaic&WIDTH={side}&HEIGHT={side}&TRANSPARENT=TRUE"
     assert site.get(query).status_code == 200

@@ -18,7 +18,6 @@ from skyquilt.model.event import Note, Result
 from skyquilt.ortho.exposure import NEUTRAL
 from skyquilt.settings import MosaicSettings
 from skyquilt.thermal import workflow
-from skyquilt.thermal.by_rig import draw_rigged
 from skyquilt.thermal.workflow import iter_thermal
 
 HEAT = Camera.ideal(width=320, height=256, focal=400.0)
@@ -123,12 +122,11 @@ def test_a_frame_that_is_lost_before_it_is_drawn_is_left_out(
     shutil.copytree(frames, tmp_path / "heat")
     gone = sorted((tmp_path / "heat").glob("*.tif"))[2]
 
-    def drawn(*arguments):
+    def drift(*_):
         gone.unlink(missing_ok=True)
-        draw_rigged(*arguments)
+        return NEUTRAL
 
-    monkeypatch.setattr(workflow, "draw_rigged", drawn)
-    monkeypatch.setattr(workflow, "drift_of_rigged", lambda *_: NEUTRAL)
+    monkeypatch.setattr(workflow, "drift_of_rigged", drift)
     *before, last = iter_thermal(flight / "photos", tmp_path / "heat", output, SETTINGS)
     told = last.metrics["thermal"]
     assert told["route"] == "rig" and told["photos_used"] == 8
