@@ -14,7 +14,7 @@ import rasterio
 from skyquilt.geometry.frames import cam_R_map_from_angles
 from skyquilt.imaging.grey import DETAIL_CELLS, detail
 from skyquilt.model.poses import Pose, TiePoints, no_ties
-from skyquilt.ortho.sharpness import find_blurred
+from skyquilt.ortho.sharpness import _places, find_blurred
 from skyquilt.settings import MosaicSettings
 from skyquilt.simulate import preset, simulate
 from skyquilt.simulate.camera import Lens
@@ -91,6 +91,17 @@ def test_photos_of_water_are_not_called_blurred():
     details = seen(alignment)
     details[7] -= 2.0
     assert found(alignment, details) == ({}, ())
+
+
+def test_level_ground_far_above_zero_is_looked_at_where_it_lies():
+    """Photos that were laid on level ground by their metadata have no tie points."""
+    alignment = flight(40, ties=False)
+    up = {k: replace(p, map_C=p.map_C + [0, 0, 400.0]) for k, p in alignment.poses.items()}
+    lifted = replace(alignment, poses=up, frame=replace(alignment.frame, takeoff_m=400.0))
+    for low, high in zip(
+        *(_places(a, range(40), (4, 5)) for a in (alignment, lifted)), strict=True
+    ):
+        np.testing.assert_allclose(high, low, atol=1e-6)
 
 
 def test_a_spot_on_the_lens_is_found_and_only_there():

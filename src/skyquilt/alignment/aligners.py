@@ -307,7 +307,7 @@ def share_shown(pose: Pose, camera: Camera, alignment: Alignment, by: Sequence[i
     """
     if not len(alignment.ties.xyz):
         return 0.0
-    ground = float(np.median(alignment.ties.xyz[:, 2]))
+    ground = alignment.ground_m
     if pose.map_C[2] <= ground:
         return 1.0
     places = ground_places(pose, camera, ground)

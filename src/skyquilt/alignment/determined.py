@@ -79,7 +79,7 @@ def _elsewhere(
     away = np.linalg.norm(off - np.median(off, axis=0), axis=1)
     sigma = np.maximum([priors[i].sigma_C[0] for i in own], np.median(away))
     ties = alignment.ties
-    high = np.array([alignment.poses[i].map_C[2] - alignment.ground_m for i in own])
+    high = np.array([alignment.poses[i].map_C[2] for i in own]) - alignment.ground_m
     count = np.array([len(rows) for rows in map(ties.of_photos(block).__getitem__, own)])
     few = count < min(AGAINST, OF_USUAL * float(np.median(count)))
     elsewhere = few & lies_elsewhere(away, sigma, high)

@@ -84,7 +84,7 @@ class ByMetadata:
                 else np.full(len(z), self.height_m)
             )
         if frame.vertical_datum != "takeoff":
-            z = np.array([_above_takeoff(p) for p in photos])
+            z = np.array([p.above_takeoff_m for p in photos], np.float64)  # NaN for None
         if frame.vertical_datum != "takeoff" and not np.isfinite(z).any():
             told = frame.vertical_datum != "unknown"
             given = (
@@ -114,12 +114,6 @@ class ByMetadata:
     def _pose(self, prior: Prior, heights: NDArray[np.float64], i: int) -> Pose:
         R = cam_R_map_from_angles(prior.yaw_deg, prior.pitch_deg, prior.roll_deg)
         return Pose(cam_R_map=R, map_C=np.array([prior.map_C[0], prior.map_C[1], heights[i]]))
-
-
-def _above_takeoff(photo: Photo) -> float:
-    """A photo's height above take-off in m; NaN where it tells none."""
-    told = photo.height_m if photo.position is None else photo.position.takeoff_m
-    return np.nan if told is None else told
 
 
 def on_ground(frame: MapFrame, priors: Sequence[Prior], heights_m: NDArray[np.float64]) -> MapFrame:

@@ -228,6 +228,11 @@ class Photo:
     """Time in s of the frame in the clip that `path` is; None where `path` is a photo."""
 
     @property
+    def above_takeoff_m(self) -> float | None:
+        """Height above take-off in m that it tells."""
+        return self.position.takeoff_m if self.position else self.height_m
+
+    @property
     def pixels_key(self) -> str:
         """Stands for its pixels as they are read: the digest of its file, and what is mended."""
         faults = "" if self.faults is None else self.faults.key

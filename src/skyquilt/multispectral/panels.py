@@ -60,11 +60,11 @@ def by_panels(
     seen: dict[str, list[_Seen]] = {}
     reasons: dict[str, str] = {}
     for band in with_panel:
-        found = [_look(*item) for item in zip(band.photos, band.tags, band.converts, strict=True)]
-        when = clocks(band.photos)
-        for at, said in zip(when, found, strict=True):
+        times = clocks(band.photos).tolist()
+        for item in zip(band.photos, band.tags, band.converts, times, strict=True):
+            said = _look(*item)
             if isinstance(said, _Seen):
-                seen.setdefault(band.name, []).append(replace(said, time_s=float(at)))
+                seen.setdefault(band.name, []).append(said)
             elif said:
                 reasons.setdefault(band.name, said)
     lacking = [name for name in light if name not in seen]
@@ -112,7 +112,7 @@ def _lit(files: BandFiles, seen: Sequence[_Seen]) -> tuple[tuple[Reflectance, ..
     factor = float(np.median(both)) if both else None
     times, light = np.array([(s.time_s, s.light) for s in seen]).T
     timed = np.isfinite(times)
-    order = np.argsort(times[timed], kind="stable")
+    order = np.flatnonzero(timed)[np.argsort(times[timed], kind="stable")]
     found, read = [], False
     for convert, at in zip(files.converts, clocks(files.photos), strict=True):
         if convert.kind == "counts":
@@ -121,16 +121,18 @@ def _lit(files: BandFiles, seen: Sequence[_Seen]) -> tuple[tuple[Reflectance, ..
         if factor is not None and convert.irradiance is not None:
             own = factor * convert.irradiance
             read = read or convert.best == "reflectance"
-        elif timed.any() and np.isfinite(at):
-            own = float(np.interp(at, times[timed][order], light[timed][order]))
+        elif len(order) and np.isfinite(at):
+            own = float(np.interp(at, times[order], light[order]))
         else:
             own = float(light.mean())
         found.append(replace(convert, kind="reflectance", best="reflectance", irradiance=own))
     return tuple(found), factor if read else None
 
 
-def _look(photo: Photo, tags: BandTags, convert: Reflectance) -> _Seen | str:
-    """What a file with a panel tells, else why it tells nothing; empty where it shows none."""
+def _look(photo: Photo, tags: BandTags, convert: Reflectance, time_s: float) -> _Seen | str:
+    """What a file with a panel tells, taken at `time_s`, else why it tells nothing; empty where it
+    shows none.
+    """
     if tags.panel is None or convert.kind == "counts":
         return "the files do not say how their counts came about" if tags.panel else ""
     try:
@@ -147,7 +149,7 @@ def _look(photo: Photo, tags: BandTags, convert: Reflectance) -> _Seen | str:
     if not mean > 0 or values.std() > _UNEVEN * mean:
         return f"that in {photo.name} is not evenly bright"
     light = math.pi * mean / tags.panel.reflectance
-    return _Seen(time_s=math.nan, light=light, sensor=convert.irradiance)
+    return _Seen(time_s=time_s, light=light, sensor=convert.irradiance)
 
 
 def _inside(panel: Panel, shape: tuple[int, ...]) -> NDArray[np.bool_]:

@@ -120,8 +120,7 @@ def _places(
     rows, columns = cells
     v, u = np.mgrid[:rows, :columns].reshape(2, -1) + 0.5
     out, apart = np.full((len(photos), rows * columns, 2), np.nan), np.zeros(len(photos))
-    xyz = alignment.ties.xyz
-    ground = level(float(np.median(xyz[:, 2])) if len(xyz) else 0.0)
+    ground = level(alignment.ground_m)
     for k, i in enumerate(photos):
         pose, camera = alignment.poses[i], alignment.camera(i)
         px = np.column_stack([u / columns * camera.width, v / rows * camera.height]) - 0.5

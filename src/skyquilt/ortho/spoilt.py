@@ -86,7 +86,7 @@ def spoilt_parts(
     if white:
         notes += (overexposed_note([names[i] for i in white]),)
     xyz = alignment.ties.xyz
-    flat = level(float(np.median(xyz[:, 2])) if len(xyz) else 0.0)
+    flat = level(alignment.ground_m)
     placed = make_views(alignment, flat)
     views = [v for v in placed if v.photo in of_8_bits]
     spots, told = find_spots(alignment, views, flat, thumbnails)
@@ -158,7 +158,7 @@ def _ground_below(alignment: Alignment, photos: Sequence[int]) -> NDArray[np.flo
     where they have none.
     """
     ties = alignment.ties
-    usual = float(np.median(ties.xyz[:, 2])) if len(ties.xyz) else 0.0
+    usual = alignment.ground_m
     own = ties.of_photos(photos)
     z = (ties.xyz[ties.point[own[i]], 2] for i in photos)
     return np.array([float(np.median(n)) if len(n) else usual for n in z])

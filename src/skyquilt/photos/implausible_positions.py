@@ -119,7 +119,7 @@ def without_ground_heights(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], 
 
     Some firmware always writes `RelativeAltitude` 0; nobody maps from below 2 m.
     """
-    heights = [h for p in photos if (h := _above_takeoff(p)) is not None]
+    heights = [h for p in photos if (h := p.above_takeoff_m) is not None]
     if not heights or max(map(abs, heights)) > _GROUND_M:
         return tuple(photos), ()
     note = f"The heights above take-off stay within {_GROUND_M:.0f} m of zero and were not used."
@@ -143,12 +143,7 @@ def without_stuck(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str
         if place
         else ""
     )
-    return tuple(replace(p, position=None, height_m=_above_takeoff(p)) for p in photos), (note,)
-
-
-def _above_takeoff(photo: Photo) -> float | None:
-    """The height above take-off in m that a photo tells."""
-    return photo.position.takeoff_m if photo.position else photo.height_m
+    return tuple(replace(p, position=None, height_m=p.above_takeoff_m) for p in photos), (note,)
 
 
 def _unraised(photo: Photo) -> Photo:

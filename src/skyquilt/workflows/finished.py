@@ -108,7 +108,7 @@ class Earlier:
             labels=labels and _labels(labels, where),
             shown=tuple(where.get(i, -1) for i in known.shown),
             key=self.key,
-            files=known.files == stamps(output),
+            files=known.files == sizes_and_times(output),
         )
 
     def _where(self, photos: Sequence[Photo]) -> dict[int, int]:
@@ -123,7 +123,7 @@ def control_key(control: Sequence[ControlPoint]) -> str:
     return digest(list(control))
 
 
-def stamps(output: Path) -> tuple[tuple[int, ...], ...]:
+def sizes_and_times(output: Path) -> tuple[tuple[int, ...], ...]:
     """Size and time of a run's rasters: whether they are still those that were written."""
     found = (output / name for name in FILES)
     return tuple((p.stat().st_size, p.stat().st_mtime_ns) if p.is_file() else () for p in found)
