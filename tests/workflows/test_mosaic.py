@@ -124,6 +124,7 @@ def test_heights_are_those_of_the_country(finished, flight):
         rasterio.open(flight / "truth" / "truth_surface.tif") as true,
     ):
         tags = mine.tags()
+        assert mine.units == ("m",)
         z = mine.read(1)
         rows, columns = np.nonzero(np.isfinite(z))
         few = slice(None, None, max(1, len(rows) // 4000))

@@ -351,6 +351,7 @@ def write_surface(output: Path, ground: Ground, alignment: Alignment) -> None:
         compress="zstd",
         nodata=float("nan"),
         tags={"SOFTWARE": "Skyquilt"} | about,
+        band_units=("m",) if alignment.frame.metric else (),
     )
     write_array(output / "surface.tif", z, spec)
 
