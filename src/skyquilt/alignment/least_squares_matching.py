@@ -58,7 +58,7 @@ class LeastSquaresMatching:
     """Least standard deviation of a refined observation, in usual ones."""
     bluntest: float = 8.0
     """Largest, likewise; also that of observations that keep their place."""
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 5
 
     def __call__(
         self,
@@ -114,13 +114,13 @@ class LeastSquaresMatching:
         shift, score, told = self._registered(patches, first, others)
         moved = self._on_image(tracks, xyz, poses, cameras, others, shift, scale)
         # a point that its rays do not determine may lie anywhere, and a step on the ground be wide
-        far = np.linalg.norm(moved - tracks.px[others], axis=1) / scale[others]
+        far = np.linalg.norm((moved - tracks.px[others]) / scale[others], axis=1)
         good = (np.nan_to_num(score) > self.agree) & (far < 4 * MARGIN)
         px, sigma = tracks.px.copy(), tracks.sigma_px.copy()
         px[others[good]] = moved[good]
-        sharp = np.maximum(self.sigma * scale[others[good]], 0.2)
-        sigma[others[good]] = sharp
-        sigma[first[good]] = np.maximum(self.sigma * scale[first[good]], 0.2)
+        sharp = np.maximum(self.sigma * scale[:, 0], 0.2)
+        sigma[others[good]] = sharp[others[good]]
+        sigma[first[good]] = sharp[first[good]]
         return px, sigma, _of_observations(np.maximum(told, LEAST), others, first, good, len(px))
 
     def _registered(
@@ -160,19 +160,21 @@ class LeastSquaresMatching:
         grey: GreyPicture,
     ) -> tuple[NDArray[np.uint8], Array]:
         """Patches (N, s + 2 margin, ...) of all observations rectified to the level ground of their
-        point, centred at each observation, and the image scales (N,): sensor px per image px.
+        point, centred at each observation, and the image scales (N, 2): sensor px per image px
+        along x and y. Both sides of an image are rounded, and they differ by it.
         """
         full = self.side + 2 * MARGIN
         out = np.zeros((len(tracks.point), full, full), np.uint8)
-        scale = np.ones(len(tracks.point))
+        scale = np.ones((len(tracks.point), 2))
         step = (np.arange(full) - full // 2).astype(float)
         for photo in np.unique(tracks.photo).tolist():
             own = np.flatnonzero(tracks.photo == photo)
             picture, camera = grey(photo, self.longest), cameras[photo]
-            scale[own] = camera.width / picture.shape[1]
-            gx, gy = ground_axes(xyz[tracks.point[own]], poses[photo], camera, scale[own[0]])
+            each = np.array([camera.width, camera.height]) / picture.shape[1::-1]
+            scale[own] = each
+            gx, gy = ground_axes(xyz[tracks.point[own]], poses[photo], camera, each)
             # the mapping from ground to image is nearly affine over a few pixels
-            centre = (tracks.px[own] + 0.5) / scale[own[0]] - 0.5
+            centre = (tracks.px[own] + 0.5) / each - 0.5
             u = (
                 centre[:, 0, None, None]
                 + gx[:, 0, None, None] * step
@@ -239,11 +241,11 @@ def _of_observations(
     return out
 
 
-def ground_axes(X: Array, pose: Pose, camera: Camera, scale: float) -> tuple[Array, Array]:
+def ground_axes(X: Array, pose: Pose, camera: Camera, scale: Array) -> tuple[Array, Array]:
     """Shift in image px (n, 2) per patch px eastwards and southwards on level ground at X
-    (n, 3).
+    (n, 3). `scale` (2,): sensor px per image px along x and y.
     """
-    size = np.abs(pose.map_C[2] - X[:, 2]) / camera.focal * scale
+    size = np.abs(pose.map_C[2] - X[:, 2]) / camera.focal * scale[0]
     px = [_pixel(camera, pose, p) / scale for p in (X, X + _along(size, 0), X - _along(size, 1))]
     return px[1] - px[0], px[2] - px[0]
 

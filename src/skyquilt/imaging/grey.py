@@ -148,3 +148,15 @@ def full_px(px: NDArray[Any], shape: tuple[int, int], full: tuple[int, int]) -> 
     """
     factor = np.array([full[1] / shape[1], full[0] / shape[0]])
     return np.asarray((np.asarray(px, np.float64) + 0.5) * factor - 0.5)
+
+
+def shrunken_px(
+    u: NDArray[np.float32], v: NDArray[np.float32], shape: tuple[int, int], full: tuple[int, int]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Columns u and rows v of a full image (H, W) on a shrunken one of `shape` (H, W), centres at
+    integers. Both sides of that are rounded, so its pixels may be oblong by a thousandth: at the
+    far rim half a pixel.
+    """
+    across, down = (np.float32(n / m) for n, m in zip(shape[::-1], full[::-1], strict=True))
+    half = np.float32(0.5)
+    return (u + half) * across - half, (v + half) * down - half

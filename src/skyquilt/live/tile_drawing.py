@@ -208,15 +208,7 @@ class Canvas:
             if scale < 1
             else (camera.width, camera.height)
         )
-        scale = w / camera.width
-        small = replace(
-            camera,
-            width=w,
-            height=h,
-            focal=camera.focal * scale,
-            cx=(camera.cx + 0.5) * scale - 0.5,
-            cy=(camera.cy + 0.5) * scale - 0.5,
-        )
+        small = camera.reduced(w, h)
         x, y, z = pose.map_C.tolist()
         reach = min(1.5 * abs(z - self.ground), MOST_CELLS / 2 * self.heights.cell)
         surface = self.surface((x - reach, y - reach, x + reach, y + reach))

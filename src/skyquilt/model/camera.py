@@ -95,6 +95,22 @@ class Camera:
             sigmas=sigmas,
         )
 
+    def reduced(self, width: int, height: int) -> "Camera":
+        """The lens on a picture that shows all of the image on fewer px: both sides are rounded, so
+        its px may be a little oblong.
+        """
+        across, down = width / self.width, height / self.height
+        return replace(
+            self,
+            width=width,
+            height=height,
+            focal=self.focal * across,
+            aspect=self.aspect * down / across,
+            cx=(self.cx + 0.5) * across - 0.5,
+            cy=(self.cy + 0.5) * down - 0.5,
+            sigmas=None,
+        )
+
     def mirrored(self) -> "Camera":
         """The calibration of the same camera's files turned by 180 degrees."""
         cx, cy = self.width - 1 - self.cx, self.height - 1 - self.cy

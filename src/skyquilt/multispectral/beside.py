@@ -61,7 +61,7 @@ class Beside:
 
     def reduced(self, shape: tuple[int, int]) -> Camera:
         """Its lens on a photo reduced to this shape."""
-        return self.camera.rescaled(shape[1], shape[0])
+        return self.camera.reduced(shape[1], shape[0])
 
     def sees(self, ray_a: Array, nearness: Array) -> Array:
         """Its pixels (n, 2) of what lies on rays (n, 3) of the map's camera, at 1 over a depth."""
@@ -138,8 +138,8 @@ def seen_by(pair: Together, beside: Beside, shape: tuple[int, int]) -> Orientati
     rows, columns = (np.arange(0, n + _NODE, _NODE, dtype=np.float64) for n in (h, w))
     x, y = np.meshgrid(columns, rows)
     there = beside.in_photo(np.c_[x.ravel(), y.ravel()], small, pair)[0].reshape(*x.shape, 2)
-    scale = max(pair.a.shape) / max(pair.camera_a.width, pair.camera_a.height)
-    there = ((there + 0.5) * scale - 0.5).astype(np.float32)
+    across, down = pair.a.shape[1] / pair.camera_a.width, pair.a.shape[0] / pair.camera_a.height
+    there = ((there + 0.5) * [across, down] - 0.5).astype(np.float32)
     # nodes of an enlarged image, whose corners lie at the first and the last node
     map_x, map_y = np.meshgrid(
         np.arange(w, dtype=np.float32) / _NODE, np.arange(h, dtype=np.float32) / _NODE

@@ -25,6 +25,7 @@ from scipy.optimize import least_squares
 from skyquilt.coregistration.agreement import scores, summit
 from skyquilt.coregistration.orientation import Orientation
 from skyquilt.geometry.camera import rays
+from skyquilt.imaging.grey import full_px
 from skyquilt.model.camera import Camera
 from skyquilt.model.photo import evenly
 from skyquilt.model.registration import RefusedRegistration
@@ -193,7 +194,8 @@ class FindBandRig:
             small = there.reduced(b.shape)
             a = seen_by(pair, there, b.shape)
             px, shift = _shifts(a, b, reach, apart)
-            px_b = _full(px + shift, small, there.camera)
+            full = there.camera.height, there.camera.width
+            px_b = full_px(px + shift, b.shape, full)
             px_a, near = there.in_photo(px, small, pair)
             rows.append((px_a, px_b, near, np.full(len(px_a), k, np.intp)))
         px_a, px_b, near, pair_ = (np.concatenate([row[n] for row in rows]) for n in range(4))
@@ -259,12 +261,6 @@ def _deviations(told: Camera, sigma_focal: float) -> dict[str, float]:
 def _scale(camera: Camera, side: int) -> float:
     """Pixels of a photo for one of it reduced to the area of a square of a side."""
     return max(1.0, float(np.sqrt(camera.width * camera.height)) / side)
-
-
-def _full(px: Array, small: Camera, full: Camera) -> Array:
-    """Places (n, 2) of a reduced photo in px of the full one."""
-    scale = max(full.width, full.height) / max(small.width, small.height)
-    return np.asarray((px + 0.5) * scale - 0.5)
 
 
 def _shifts(a: Orientation, b: Orientation, reach: int, apart: float) -> tuple[Array, Array]:

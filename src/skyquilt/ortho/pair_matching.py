@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.grey import stretched
+from skyquilt.imaging.grey import shrunken_px, stretched
 from skyquilt.imaging.nodes import STEP, View, densify, inside_everywhere, project_nodes
 
 Float = NDArray[np.float32]
@@ -193,8 +193,7 @@ def _rectified(
     nodes = project_nodes(view, at[..., 0], at[..., 1], at[..., 2])
     u, v = densify(nodes.u, h, w), densify(nodes.v, h, w)
     seen = inside_everywhere(nodes, u, v)
-    scale, half = np.float32(picture.shape[1] / view.camera.width), np.float32(0.5)
-    u, v = (u + half) * scale - half, (v + half) * scale - half
+    u, v = shrunken_px(u, v, picture.shape, (view.camera.height, view.camera.width))
     warped = cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(warped, np.uint8), seen
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.workers import Ahead
+from skyquilt.imaging.grey import shrunken_px
 from skyquilt.imaging.nodes import STEP, View, densify, overlapping, project_all
 from skyquilt.model.raster import Grid
 from skyquilt.model.surface import Surface, least_cell
@@ -84,7 +85,7 @@ class SeamLines:
     """The same for a height of one metre or more above the surroundings, in grey values."""
     least: int = 24
     """Undisputed patches of fewer cells are contested too."""
-    version: ClassVar[int] = 5
+    version: ClassVar[int] = 6
 
     def __call__(
         self,
@@ -364,11 +365,9 @@ class _Scene:
             at, near = _extent(mine)
             size = (at[0].stop - at[0].start, at[1].stop - at[1].start)
             picture = self._grey(view.photo, self._longest)
-            scale, half = np.float32(picture.shape[1] / view.camera.width), np.float32(0.5)
             u, v = (densify(p[near], *size, 2) for p in (n.u, n.v))
-            value = cv2.remap(
-                picture, (u + half) * scale - half, (v + half) * scale - half, cv2.INTER_LINEAR
-            )
+            small = shrunken_px(u, v, picture.shape, (view.camera.height, view.camera.width))
+            value = cv2.remap(picture, *small, cv2.INTER_LINEAR)
             np.copyto(out[at], self._exposure.grey(view, value, u, v), where=mine[at])
         return out
 

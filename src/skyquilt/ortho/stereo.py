@@ -128,7 +128,7 @@ class Stereo:
     """Side of a cell in pixels of the finest pictures that are matched, within `cell_px`."""
     cell_px: tuple[int, int] = (4, 8)
     """Least and greatest side of a cell in map pixels."""
-    version: ClassVar[int] = 8
+    version: ClassVar[int] = 9
 
     def __call__(
         self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture, keep: Keep
