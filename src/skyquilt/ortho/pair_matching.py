@@ -33,6 +33,15 @@ CLIP = 63
 """Slopes of the pictures are compared up to this many grey values."""
 TEXTURE = 1.5
 """Least standard deviation of grey values in a window that is compared: more than noise."""
+REFINED = 9
+"""Side in px of the window over which disparities are refined."""
+MOST_BEND = 0.75
+"""Disparities that differ by more than this in px within the window are left as they are."""
+MOST_STEP = 0.6
+"""Largest refinement in px."""
+FLAT = 4.0
+"""Mean square of slopes, in grey values per px, at which a refinement is halved: noise has as much.
+"""
 TALLEST = 0.7
 """Largest height over the plane that is searched, as a share of the cameras' height."""
 
@@ -170,10 +179,31 @@ def _disparities(
     )
     found = match.compute(*wide)[:, before : before + left.shape[1]]
     d = np.asarray(found.astype(np.float32) / np.float32(SUBPIXEL), np.float32)
+    d = _refined(d, left, right)
     there = np.arange(d.shape[1], dtype=np.float32) - d
     other = np.clip(np.rint(there), 0, d.shape[1] - 1).astype(np.intp)
     inside = (there > 0) & (there < d.shape[1] - 1) & np.take_along_axis(seen_b, other, 1)
     return d, np.asarray((d >= first) & seen & inside & _textured(left, 2 * window + 1))
+
+
+def _refined(d: Float, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> Float:
+    """Disparities (h, w) moved by least squares to where the windows around fit best (Lucas and
+    Kanade 1981), where they are smooth over the window: the matcher's own parts of a pixel are
+    pulled towards whole ones and towards the middle between them.
+    """
+    side = (REFINED, REFINED)
+    square = np.ones(side, np.uint8)
+    smooth = cv2.dilate(d, square) - cv2.erode(d, square) < MOST_BEND
+    columns = np.arange(d.shape[1], dtype=np.float32) - d
+    rows = np.broadcast_to(np.arange(d.shape[0], dtype=np.float32)[:, None], d.shape)
+    seen = cv2.remap(right, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    difference = cv2.subtract(seen, left, dtype=cv2.CV_32F)
+    difference -= cv2.blur(difference, side)  # photos differ in brightness
+    slope = cv2.Sobel(cv2.add(seen, left, dtype=cv2.CV_32F), cv2.CV_32F, 1, 0, scale=1 / 16)
+    weight = cv2.blur(slope * slope, side)
+    step = cv2.blur(slope * difference, side) / (weight + np.float32(FLAT))
+    np.clip(step, -MOST_STEP, MOST_STEP, out=step)
+    return np.asarray(np.where(smooth, d + step, d), np.float32)
 
 
 def _textured(picture: NDArray[np.uint8], side: int) -> Mask:
