@@ -84,8 +84,10 @@ class SmallPictures:
         factor = max(photo.width, photo.height) / longest
         ready = self.full.peek(member.id)
         if ready is None:
-            step: Reduction = 8 if factor >= 8 else 4 if factor >= 4 else 2 if factor >= 2 else 1
-            ready = read_color(photo, reduction=step)
+            # a last row or column of less than a whole step would count as a whole one
+            steps: tuple[Reduction, ...] = (8, 4, 2)
+            fits = (s for s in steps if factor >= s and not (photo.width % s or photo.height % s))
+            ready = read_color(photo, reduction=next(fits, 1))
         return np.ascontiguousarray(shrink(ready, longest)[0])
 
 
