@@ -246,6 +246,44 @@ def test_a_preview_gives_way_to_the_full_picture(flight, tmp_path):
     live.close()
 
 
+def test_all_that_came_of_a_shot_before_gives_way(flight, tmp_path, monkeypatch):
+    """Two previews, the full photo, and that file written anew, all before one was placed; another
+    shot of the same name stays.
+    """
+    live = LiveMap(tmp_path / "out", LiveSettings())
+    for size in (200, 300):
+        monkeypatch.setattr("skyquilt.live.replay_flight.PREVIEW", size)
+        live.intake.take([preview_of(flight.photos[0])], f"{size}.jpg", "a")
+    monkeypatch.setattr("skyquilt.live.replay_flight.PREVIEW", 480)
+    live.intake.take([preview_of(flight.photos[0])], "a.jpg", "a")  # of the size of the photo
+    live.intake.take([flight.photos[0].read_bytes()], "a.jpg", "a")
+    live.intake.take([flight.photos[1].read_bytes()], "a.jpg", "a")
+    for _ in live.drain():
+        pass
+    states = [m.state for m in live.members.by_id.values()]
+    assert states[:3] == ["superseded"] * 3
+    assert not {"superseded", "received", "refused"} & set(states[3:])
+    assert [i for i in (1, 2, 3, 4, 5) if live.canvas.tiles_of(i)] == [4, 5]
+    live.close()
+
+
+def test_a_preview_gives_way_on_a_map_begun_again(flight, tmp_path, monkeypatch):
+    """The full photo came before the map was begun again, and was not placed yet."""
+    live = LiveMap(tmp_path / "out", LiveSettings())
+    monkeypatch.setattr("skyquilt.live.replay_flight.PREVIEW", 240)
+    live.intake.take([preview_of(flight.photos[0])], "preview.jpg", "a")
+    for _ in live.drain():
+        pass
+    live.intake.take([flight.photos[0].read_bytes()], "a.jpg", "a")
+    live.members.take_up()
+    live.initial_pose.begin_again(live.members.by_id[1])
+    live._reload()
+    for _ in live.drain():
+        pass
+    assert live.members.by_id[1].state == "superseded"
+    live.close()
+
+
 def test_a_photo_without_position_waits_and_is_placed_by_its_links(flight, tmp_path):
     lost = tmp_path / "lost.jpg"
     shutil.copyfile(flight.photos[1], lost)

@@ -62,8 +62,8 @@ class InitialPose:
         if self.members.frame is not None and self.canvas.gsd == 0:
             self._begin(first, warning)
         why = self.members.far_note(member.photo)
-        preview = self._preview(member)
-        known = preview.pose if preview is not None else None
+        previews = self._previews(member)
+        known = next((m.pose for m in reversed(previews) if m.pose is not None), None)
         pose = known if known is not None else self.metadata.first(member)
         self.pixels(member.id)
         with self.ledger.change():
@@ -73,13 +73,13 @@ class InitialPose:
                 self.ledger.put_meta(NO_PLACE, True)
                 self.ledger.tell("note", {"text": f"{NOWHERE}."})
                 warning = NOWHERE
-            if preview is not None:
+            for preview in previews:
                 preview.state = "superseded"
                 self.members.save(preview)
                 self.map_events.superseded(preview)
             self.map_events.photo(member, **({"reason": why} if why else {}))
         hit("photo placed")
-        if preview is not None:
+        for preview in previews:
             self.redraw.gone(preview.id)
         self.queues.received.popleft()
         self.queues.untried.append(member)
@@ -147,20 +147,23 @@ class InitialPose:
 
     def _off(self, member: Member, *, keep: bool) -> None:
         """Takes a photo off the map (inside a transaction); with `keep` it stays compared."""
+        placed = member.state != "received"  # others still know the previews that they replace
         if member.state in ("placed", "refined", "waiting"):
             member.state = "waiting" if keep else "received"
             self.map_events.photo(member, ring=[], at=None)
         if member.state in ("received", "superseded", "waiting"):
             member.pose, member.camera, member.learned = None, "", None
-            about = about_record(member, "") if keep else {}
-            self.members.save(member, footprint="", reason="", about=about)
+            about = {"about": about_record(member, "") if keep else {}} if placed else {}
+            self.members.save(member, footprint="", reason="", **about)
 
-    def _preview(self, member: Member) -> Member | None:
-        """The preview of the same shot that arrived before this photo; None if there is none."""
+    def _previews(self, member: Member) -> list[Member]:
+        """What arrived of the same shot before this photo and gives way to it, the oldest first:
+        previews, and the file before it was written anew.
+        """
         row = self.ledger.row("select about from photo where id = ?", member.id)
         about = json.loads(row[0]) if row is not None and row[0] else {}
-        known = (self.members.by_id[i] for i in about.get("preview", ()) if i in self.members.by_id)
-        return next(known, None)
+        known = (self.members.by_id.get(i) for i in about.get("preview", ()))
+        return [m for m in known if m is not None and m.state not in ("superseded", "refused")]
 
     def _begin(self, member: Member, warning: str) -> None:
         """Fixes the map's frame and pixel size for the whole survey, with a warning, if any."""

@@ -159,12 +159,13 @@ class Intake:
                 gone(arrived.path)
                 return self.refuse(name, source, reason)
             same = self.ledger.rows(
-                "select id, name, width from photo where shot = ? and width != ? and state !="
-                " 'superseded'"
-                " and state != 'refused'",
+                "select id, name, width from photo where shot = ? and (width != ? or (name = ? and"
+                " source = ?)) and state not in ('superseded', 'refused')",
                 shot,
                 photo.width,
-            )
+                name,
+                source,
+            )  # smaller ones, and the same file before it was written anew
             larger = next((n for _, n, w in same if w > photo.width), None)
             if larger is not None:
                 gone(arrived.path)
