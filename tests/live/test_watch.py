@@ -144,6 +144,20 @@ def test_a_file_that_vanishes_is_forgotten(watched, flight):
     assert not watched.watch.growing
 
 
+def test_a_folder_made_in_place_of_a_renamed_one_is_watched(watched, flight, monkeypatch):
+    """Not by scans alone: the second photo comes when none is due."""
+    if not watched.watch._closed.told:
+        pytest.skip("this system does not report closed files")
+    monkeypatch.setattr(watching, "SCAN_TOLD_S", 60.0)
+    watched.folder.rename(watched.folder.with_name("yesterday"))
+    assert watched.look(0.1) == []
+    watched.folder.mkdir()
+    shutil.copyfile(flight.photos[0], watched.folder / "a.jpg")
+    assert [d.name for d in watched.look(0.2)] == ["a.jpg"]
+    shutil.copyfile(flight.photos[1], watched.folder / "b.jpg")
+    assert [d.name for d in watched.look(0.2)] == ["b.jpg"]
+
+
 def test_a_folder_that_cannot_be_read_is_named_once(watched, flight, monkeypatch):
     monkeypatch.setattr(watching, "SCAN_TOLD_S", 0.2)
     hidden = watched.folder / "drone 2"

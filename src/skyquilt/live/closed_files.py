@@ -13,7 +13,7 @@ from typing import Any
 from skyquilt.outside import is_folder, walk
 
 CLOSE_WRITE, MOVED_TO, CREATE, IS_DIR, OVERFLOW = 0x8, 0x80, 0x100, 0x40000000, 0x4000
-IGNORED = 0x8000
+IGNORED, MOVE_SELF = 0x8000, 0x800
 _HEAD = struct.Struct("iIII")
 
 
@@ -47,7 +47,7 @@ class ClosedFiles:
         every = True
         for here, _, _ in walk(Path(folder)):
             number = self._libc.inotify_add_watch(
-                self._handle, os.fsencode(here), CLOSE_WRITE | MOVED_TO | CREATE
+                self._handle, os.fsencode(here), CLOSE_WRITE | MOVED_TO | CREATE | MOVE_SELF
             )
             every &= number >= 0
             if number < 0:
@@ -72,6 +72,9 @@ class ClosedFiles:
                 name = os.fsdecode(data[at + _HEAD.size : at + _HEAD.size + size].rstrip(b"\0"))
                 at += _HEAD.size + size
                 path = str(Path(self._folders.get(number, "")) / name)
+                if mask & MOVE_SELF and self._folders.get(number) == str(self.folder):
+                    # renamed; another one may take its place
+                    self._libc.inotify_rm_watch(self._handle, number)
                 if mask & IGNORED and self._folders.pop(number, "") == str(self.folder):
                     self._lost = True  # the folder was removed, or its disk
                 if mask & IS_DIR:
