@@ -198,7 +198,7 @@ def _refined(d: Float, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> Flo
     rows = np.broadcast_to(np.arange(d.shape[0], dtype=np.float32)[:, None], d.shape)
     seen = cv2.remap(right, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     difference = cv2.subtract(seen, left, dtype=cv2.CV_32F)
-    difference -= cv2.blur(difference, side)  # photos differ in brightness
+    difference = cv2.subtract(difference, cv2.blur(difference, side))  # photos differ in brightness
     slope = cv2.Sobel(cv2.add(seen, left, dtype=cv2.CV_32F), cv2.CV_32F, 1, 0, scale=1 / 16)
     weight = cv2.blur(slope * slope, side)
     step = cv2.blur(slope * difference, side) / (weight + np.float32(FLAT))
