@@ -115,7 +115,7 @@ class FindBandRig:
     better is looked for."""
     sigma_m: float = 0.05
     """Standard deviation of the distance in m between two cameras along either axis."""
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
 
     def __call__(
         self, pairs: Sequence[Together], camera_b: Camera, sigma_focal: float
