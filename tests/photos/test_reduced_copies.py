@@ -45,6 +45,12 @@ def test_a_smaller_copy_whose_focal_length_counts_pixels_of_the_full_size(name):
     assert left_out(taken(name, 1, width=2000, focal=3000.0)) == {name}
 
 
+def test_a_smaller_copy_whose_focal_length_nothing_tells():
+    copy = taken("DJI_0001_small.jpg", 1, width=2000, focal=1700.0)
+    assert left_out(copy) == set()
+    assert left_out(replace(copy, focal=replace(copy.focal, source="guess"))) == {copy.name}
+
+
 @pytest.mark.parametrize("east", [-4e-6, 4e-6])
 @pytest.mark.parametrize("north", [-4e-6, 4e-6])
 def test_a_smaller_copy_whose_place_is_rounded(north, east):
@@ -60,6 +66,8 @@ def test_a_smaller_copy_whose_place_is_rounded(north, east):
     "other",
     [
         taken("zoom.jpg", 1, width=2000, focal=6000.0),  # another lens of the same drone
+        taken("DJI_0001_T.JPG", 1, width=2000, focal=6000.0),
+        taken("DJI_0001_W.JPG", 1, width=3000, focal=1200.0),
         taken("wide.jpg", 1, width=2000, height=2000),
         taken("thermal/DJI_0001.jpg", 1, width=640, band="thermal"),
         taken("101MEDIA/DJI_0001.JPG", 9, width=2000, focal=1500.0),  # another flight

@@ -198,7 +198,11 @@ def _is_reduced(photo: Photo, original: Photo) -> bool:
     # programs that reduce photos keep what their metadata tell of the pixels of the full size
     untouched = _any_size(photo) == _any_size(original)
     untouched &= abs(photo.focal.px / original.focal.px - 1) < SAME
-    return same_view or untouched or _stem(original) in _stem(photo)
+    if same_view or untouched:
+        return True
+    # a picture of another lens of the drone may be smaller and have a letter more in its name
+    unknown = "guess" in (photo.focal.source, original.focal.source)
+    return unknown and _stem(original) in _stem(photo)
 
 
 def _any_size(photo: Photo) -> str:
