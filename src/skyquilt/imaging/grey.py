@@ -151,12 +151,11 @@ def full_px(px: NDArray[Any], shape: tuple[int, int], full: tuple[int, int]) -> 
 
 
 def shrunken_px(
-    u: NDArray[np.float32], v: NDArray[np.float32], shape: tuple[int, int], full: tuple[int, int]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    u: NDArray[Any], v: NDArray[Any], shape: tuple[int, ...], full: tuple[int, int]
+) -> tuple[NDArray[Any], NDArray[Any]]:
     """Columns u and rows v of a full image (H, W) on a shrunken one of `shape` (H, W), centres at
-    integers. Both sides of that are rounded, so its pixels may be oblong by a thousandth: at the
-    far rim half a pixel.
+    integers, in their precision. Both sides of that are rounded, so its pixels may be oblong by a
+    thousandth: at the far rim half a pixel.
     """
-    across, down = (np.float32(n / m) for n, m in zip(shape[::-1], full[::-1], strict=True))
-    half = np.float32(0.5)
-    return (u + half) * across - half, (v + half) * down - half
+    across, down = shape[1] / full[1], shape[0] / full[0]
+    return (u + 0.5) * across - 0.5, (v + 0.5) * down - 0.5

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.geometry.camera import monotone_radius, pixels, rays
+from skyquilt.imaging.grey import shrunken_px
 from skyquilt.imaging.nodes import View, project_nodes
 from skyquilt.model.camera import Camera
 from skyquilt.model.surface import Surface
@@ -102,17 +103,16 @@ def _seen(
     """The patch of a grey image (h, w) of a photo, sampled at the photo's pixels u, v, where those
     are real.
     """
-    places, shown, central = [], real, real
+    shown, central = real, real
     for px, size, small in (
         (u, camera.width, picture.shape[1]),
         (v, camera.height, picture.shape[0]),
     ):
-        places.append(((px + 0.5) * px.dtype.type(small / size) - 0.5).astype(np.float32))
         off = np.abs((px + 0.5) / size - 0.5)
         shown, central = shown & (off < 0.5 - 1.5 / small), central & (off < CENTRE / 2)
-    pixels = cv2.remap(
-        picture, places[0], places[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
+    x, y = shrunken_px(u, v, picture.shape, (camera.height, camera.width))
+    places = x.astype(np.float32), y.astype(np.float32)
+    pixels = cv2.remap(picture, *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return Patch(
         column=column,
         row=row,

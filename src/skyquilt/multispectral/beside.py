@@ -14,6 +14,7 @@ from skyquilt.coregistration.agreement import scores
 from skyquilt.coregistration.orientation import Orientation, orientation
 from skyquilt.geometry.camera import project, rays
 from skyquilt.geometry.frames import rotation_from_vector
+from skyquilt.imaging.grey import shrunken_px
 from skyquilt.model.camera import Camera
 
 Array = NDArray[np.float64]
@@ -138,16 +139,13 @@ def seen_by(pair: Together, beside: Beside, shape: tuple[int, int]) -> Orientati
     rows, columns = (np.arange(0, n + _NODE, _NODE, dtype=np.float64) for n in (h, w))
     x, y = np.meshgrid(columns, rows)
     there = beside.in_photo(np.c_[x.ravel(), y.ravel()], small, pair)[0].reshape(*x.shape, 2)
-    across, down = pair.a.shape[1] / pair.camera_a.width, pair.a.shape[0] / pair.camera_a.height
-    there = ((there + 0.5) * [across, down] - 0.5).astype(np.float32)
+    full = pair.camera_a.height, pair.camera_a.width
+    places = shrunken_px(there[..., 0], there[..., 1], pair.a.shape, full)
     # nodes of an enlarged image, whose corners lie at the first and the last node
     map_x, map_y = np.meshgrid(
         np.arange(w, dtype=np.float32) / _NODE, np.arange(h, dtype=np.float32) / _NODE
     )
-    u, v = (
-        cv2.remap(np.ascontiguousarray(there[..., k]), map_x, map_y, cv2.INTER_LINEAR)
-        for k in (0, 1)
-    )
+    u, v = (cv2.remap(place.astype(np.float32), map_x, map_y, cv2.INTER_LINEAR) for place in places)
     source: NDArray[Any] = pair.a
     finer = max(pair.a.shape) / max(h, w) / 1.1
     if finer > 1.5:  # as fine as the band, or fine structure would be aliased
