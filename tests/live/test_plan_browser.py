@@ -1,5 +1,6 @@
 """A real browser plans, watches points turn, asks for what is missing, and takes the file."""
 
+import threading
 import zipfile
 
 import numpy as np
@@ -100,6 +101,21 @@ def test_an_area_is_drawn_by_keyboard(page, tmp_path):  # noqa: F811
         assert page.get_attribute("#draw-closed", "aria-pressed") == "false"
         assert page.evaluate(shapes) == [[False, 3]]
         assert page.locator("#covering li").count() == 0  # no photos were asked for
+        assert not page.errors
+
+
+def test_a_script_that_comes_late_misses_nothing(page, tmp_path):  # noqa: F811
+    """On a weak network the last script of the page comes seconds after the others."""
+    with watched(tmp_path / "out", None) as (_, _web, url):
+        late = threading.Event()
+
+        def delayed(route):
+            late.wait(2)  # longer than the page takes to connect
+            route.continue_()
+
+        page.route("**/plan.js", delayed)
+        page.goto(url)
+        page.wait_for_selector("#mission:visible")
         assert not page.errors
 
 

@@ -128,5 +128,6 @@ setInterval(watch, 2000);
 document.addEventListener("visibilitychange", watch);  // a phone that was locked
 window.addEventListener("online", () => { gone ? listen() : mend(); });
 const catchUp = () => Promise.all([readInfo(), readPhotos(), readOverlays(), readFiles(), readControl()]).catch(() => {});
-readInfo().catch(() => say("the server does not answer")).then(listen);
+// Not before all scripts of the page are there: what one of them waits for must not have happened before it listens.
+document.addEventListener("DOMContentLoaded", () => { readInfo().catch(() => say("the server does not answer")).then(listen); });
 window.skyquilt = { map, state };
