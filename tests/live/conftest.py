@@ -141,9 +141,10 @@ class Served:
                 return False
             if redraw.dirty or redraw.later or live.background.busy or schedule.under_way:
                 return False
-            # a quiet moment begins an adjustment of what was refined since the last one
+            # a quiet moment begins an adjustment of each block that was not adjusted as it is now
             quiet_s = time.monotonic() - live.blocks.last_arrival
-            if schedule.since and live.settings.reposition and quiet_s < QUIET_S + 1:
+            left = live.blocks._unfinished() or (schedule.since and quiet_s < QUIET_S + 1)
+            if live.settings.reposition and left:
                 return False
             before = self.web.get("/photos").json()
             threading.Event().wait(0.5)

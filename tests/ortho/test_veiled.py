@@ -4,13 +4,16 @@ shows the ground.
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import rasterio
 from rasterio.windows import from_bounds
 
+from skyquilt.geometry.frames import cam_R_map_from_angles
 from skyquilt.imaging.blank import around
 from skyquilt.imaging.views import footprint, make_views
+from skyquilt.model.poses import Pose
 from skyquilt.ortho.spoilt import spoilt_parts
 from skyquilt.ortho.tie_surface import level
 from skyquilt.ortho.veiled import veiled_parts
@@ -125,6 +128,29 @@ def test_photos_of_other_cameras_and_ground_sizes_are_compared_apart(alignment, 
     ]
     high = [replace(v, footprint=footprint(v.camera, v.pose, level(0.0))) for v in high]
     assert veiled_parts(high, alignment.ties.xyz, flat, {}) == {}
+
+
+@pytest.mark.slow
+def test_far_ground_of_an_orbit_is_not_veiled(alignment):
+    """Photos that look aslant at one place from all around show near ground with more contrast than
+    the photos opposite, which show it coarser.
+    """
+    away = 40 * np.tan(np.radians(55))
+    turns = {k: np.radians(30 * k) for k in range(12)}
+    poses = {
+        k: Pose(cam_R_map=cam_R_map_from_angles(30.0 * k, 55),
+                map_C=np.array([-away * np.sin(turn), -away * np.cos(turn), 40.0]))
+        for k, turn in turns.items()
+    }  # fmt: skip
+    x, y = (a.ravel() for a in np.meshgrid(*2 * [np.arange(-120, 120, 1.5)]))
+    ties = replace(alignment.ties, xyz=np.column_stack([x, y, 0 * x]))
+    orbit = replace(alignment, poses=poses, ties=ties)
+    leaves = cv2.GaussianBlur(np.random.default_rng(3).normal(0, 1, (800, 800)), (0, 0), 3)
+    leaves = cv2.resize(leaves, None, fx=4, fy=4)
+    shown = pictures(orbit, np.float32(120 + 40 * leaves / leaves.std()).clip(5, 250))
+    assert found(orbit, shown) == {}
+    fog = {**shown, 4: veiled(shown[4], np.full((300, 400), 0.8), 215)}
+    assert sorted(found(orbit, fog)) == [4]
 
 
 def test_waves_marks_and_empty_corners_veil_nothing(alignment, clean):

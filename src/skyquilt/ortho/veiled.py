@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from skyquilt.imaging.blank import EMPTY, Blank
 from skyquilt.imaging.grey import to_grey8
-from skyquilt.imaging.nodes import View, project_nodes
+from skyquilt.imaging.nodes import Nodes, View, project_nodes
+from skyquilt.imaging.view_limits import ground_sizes
 from skyquilt.photos.side_rows import sentence_of
 
 Float = NDArray[np.float32]
@@ -35,7 +36,7 @@ SIDE, CELLS = 28, 32
 longer side.
 """
 ALIKE = 1.3
-"""Largest quotient of the ground sizes of photos that are compared."""
+"""Largest quotient of the ground sizes of photos that are compared, and of their parts."""
 FEWEST_VIEWS = 3
 """Fewest photos that must show a place; the second clearest of them tells what it looks like."""
 TIED, NEAR = 3, 7
@@ -95,7 +96,7 @@ def _alike(views: Sequence[View]) -> list[list[View]]:
     """
     groups, first = list[list[View]](), np.inf
     cameras = {c: k for k, c in enumerate(dict.fromkeys(v.camera for v in views))}
-    sides = {v.photo: np.sqrt(cv2.contourArea(v.footprint.astype(np.float32))) for v in views}
+    sides = {v.photo: _side(v) for v in views}
     for view in sorted(views, key=lambda v: (cameras[v.camera], sides[v.photo], v.photo)):
         side = sides[view.photo]
         if not groups or groups[-1][0].camera != view.camera or side > ALIKE * first:
@@ -103,6 +104,11 @@ def _alike(views: Sequence[View]) -> list[list[View]]:
             first = side
         groups[-1].append(view)
     return groups
+
+
+def _side(view: View) -> float:
+    """Side in m of a square as large as what a photo shows of level ground."""
+    return float(np.sqrt(cv2.contourArea(view.footprint.astype(np.float32))))
 
 
 def _veiled(
@@ -211,8 +217,7 @@ class _Ground:
     def __init__(self, views: Sequence[View], xyz: NDArray[Any]) -> None:
         outline = np.concatenate([v.footprint for v in views])
         low, high = outline.min(0), outline.max(0)
-        areas = [cv2.contourArea(v.footprint.astype(np.float32)) for v in views]
-        self._step = max(float(np.sqrt(np.median(areas))) / SIDE, 1e-6)
+        self._step = max(float(np.median([_side(v) for v in views])) / SIDE, 1e-6)
         self._low = low
         columns, rows = (np.ceil((high - low) / self._step).astype(int) + 1).tolist()
         self._shape = rows, columns
@@ -239,8 +244,9 @@ class _Ground:
         x, y = np.meshgrid(self._low[0] + self._step * c, self._low[1] + self._step * r)
         nodes = project_nodes(view, x, y, self._z[r[0] : r[-1] + 1, c[0] : c[-1] + 1])
         seen = nodes.seen if mark is None else nodes.seen & (mark.at(nodes.u, nodes.v) > 0)
-        point = (r[:, None] * self._shape[1] + c)[seen]
         width, height = view.camera.width, view.camera.height
+        seen = seen & self._as_usual(nodes, _side(view) / np.sqrt(width * height))
+        point = (r[:, None] * self._shape[1] + c)[seen]
         across, down = (nodes.u[seen] + 0.5) / width, (nodes.v[seen] + 0.5) / height
         contrast = fine_contrast(thumbnail)
         rows, columns = contrast.shape
@@ -258,6 +264,16 @@ class _Ground:
         self._two[0, point] = np.maximum(most, value)
         self._two[1, point] = np.maximum(second, np.minimum(most, value))
         return point.astype(np.int32), cell[known].astype(np.int16), value
+
+    def _as_usual(self, nodes: Nodes, usual_m: float) -> NDArray[np.bool_]:
+        """Where (r, c) a photo's pixel shows about as much ground as its pixels do on the whole: a
+        photo that looks aslant shows far ground coarser, so with less contrast.
+        """
+        if min(nodes.u.shape) < 2:
+            return np.zeros(nodes.u.shape, np.bool_)
+        with np.errstate(invalid="ignore"):
+            times = ground_sizes(nodes.u, nodes.v, self._step) / usual_m
+        return np.asarray((times < ALIKE) & (times > 1 / ALIKE))
 
     def clearest(self) -> Float:
         """The second largest contrast of all points, NaN where they tell nothing of a photo."""
