@@ -99,6 +99,13 @@ def test_positions_that_tell_scale_and_direction_are_not_touched():
         assert told_besides(found, survey.priors, 0.0) is found
 
 
+def test_positions_of_photos_that_tell_no_height_count():
+    survey = flown(WIDE, 0)
+    found = adjusted(survey)
+    few = [replace(p, map_C=np.r_[p.map_C[:2], np.nan]) for p in survey.priors[1:]]
+    assert told_besides(found, [survey.priors[0], *few], 0.0) is found
+
+
 def test_heights_that_contradict_positions_are_told_and_not_used():
     row = [(0.0, 12.0 * k, HEIGHT, 0.0, 0.0) for k in range(4)]
     survey = flown(row, 0, gps=2.0, height_off=30.0)  # from a hill

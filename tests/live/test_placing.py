@@ -1,5 +1,7 @@
 """Single photos among their neighbours: what the adjustment is given."""
 
+import json
+import re
 from dataclasses import fields, replace
 
 import numpy as np
@@ -60,3 +62,42 @@ def test_a_photo_without_prior_is_one_whose_metadata_say_nothing(live):
         np.testing.assert_equal(
             getattr(second.prior, field.name), getattr(expected, field.name), field.name
         )
+
+
+def test_heights_that_some_photos_alone_tell_correct_no_others(live, monkeypatch):
+    """The height of a photo that tells none is no error of reported heights, and the other way
+    round: photos were placed at the take-off's height, or at twice their own.
+    """
+    metadata, last = live.initial_pose.metadata, live.members.by_id[4]
+    known = last.prior
+    unknown = replace(known, map_C=np.r_[known.map_C[:2], np.nan])
+    assert metadata.first(replace(last, prior=unknown)).map_C[2] == pytest.approx(60, abs=5)
+    for member in live.members.by_id.values():
+        monkeypatch.setattr(member, "prior", unknown)
+    assert metadata.first(replace(last, prior=known)).map_C[2] == pytest.approx(60, abs=5)
+
+
+def test_heights_above_take_off_that_stay_at_zero_are_not_used(flight, tmp_path):
+    """As on maps of whole flights: photos had no extent on the map, and were linked to none."""
+    live = LiveMap(tmp_path / "out", LiveSettings())
+    for k, path in enumerate(flight.photos):
+        low = re.sub(
+            rb'RelativeAltitude="[^"]{7}"', b'RelativeAltitude="+00.000"', path.read_bytes()
+        )
+        (tmp_path / path.name).write_bytes(low if k < 5 else path.read_bytes())
+    for path in flight.photos[:5]:
+        live.intake.take_file(tmp_path / path.name, "drone")
+    live.queues.received.extend(live.members.take_up())
+    while live.queues.received:
+        live.initial_pose.place(live.queues.received[0])
+    first, *others = live.members.by_id.values()
+    assert [m.pose.map_C[2] for m in (first, *others)] == [50.0] * 5
+    told = live.ledger.rows("select body from event where kind = 'note'")
+    assert [json.loads(body)["text"] for (body,) in told] == [
+        "So far: The heights above take-off stay within 2 m of zero and were not used."
+    ]
+    live.intake.take_file(tmp_path / flight.photos[5].name, "drone")  # it begins to rise
+    (last,) = live.members.take_up()
+    assert (first.prior.map_C[2], len(live.members.near)) == (0.0, 6)
+    assert last.prior.map_C[2] == pytest.approx(60, abs=3)
+    live.close()

@@ -269,6 +269,13 @@ def test_a_flight_at_height_zero_counts_from_sea_level_instead(make_jpeg):
         (p.position.altitude_m, p.position.datum, p.position.takeoff_m) for p in survey.photos
     } == {(198.3, "sea_level", None)}
     assert any("were not used" in n for n in survey.notes)
+    for i in range(3, 6):  # another drone, which tells its own
+        about = dji_exif()
+        about["0th"][piexif.ImageIFD.Model] = "another"
+        make_jpeg(f"{i}.jpg", exif=about, xmp=dji_xmp(RelativeAltitude="+40.00"), seed=i)
+    survey = read_survey(folder)
+    assert [p.above_takeoff_m for p in survey.photos] == [None] * 3 + [40.0] * 3
+    assert sum("take-off of " in n and "another" not in n for n in survey.notes) == 1
 
 
 @pytest.mark.parametrize(

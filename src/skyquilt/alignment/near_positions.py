@@ -47,10 +47,12 @@ def told_besides(found: Alignment, priors: Sequence[Prior], ground_m: float) -> 
     tell of it, where positions hardly do. Each counts by its deviation. The shape, and what the
     pictures show, stay.
     """
-    held = [i for i in found.held if np.isfinite(priors[i].map_C).all()]
-    if found.control or found.frame.crs is None or not held:
+    held = [i for i in found.held if np.isfinite(priors[i].map_C[:2]).all()]
+    high = [i for i in held if np.isfinite(priors[i].map_C[2])]
+    if found.control or found.frame.crs is None or not high:
         return found
-    scale, heading = _scale(found, priors, held, ground_m), _heading(found, priors, held)
+    scale = _scale(found, priors, held, high, ground_m)
+    heading = _heading(found, priors, held)
     says = [told.note for told in (scale, heading) if told]
     if not says:
         return found
@@ -84,6 +86,7 @@ def _loose(
     """
     C = np.array([found.poses[i].map_C for i in held])
     sigma = np.array([priors[i].sigma_C for i in held])
+    sigma[~np.isfinite([priors[i].map_C for i in held])] = np.inf
     reach = C - np.average(C, axis=0, weights=sigma[:, 0] ** -2)
     stated, lasting = (
         float(((reach / by)[:, :axes] ** 2).sum()) for by in (sigma, np.minimum(sigma, LASTING_M))
@@ -121,15 +124,20 @@ def weighed(apart: float, loose: NDArray[np.float64], told: float) -> tuple[floa
 
 
 def _scale(
-    found: Alignment, priors: Sequence[Prior], held: Sequence[int], ground_m: float
+    found: Alignment,
+    priors: Sequence[Prior],
+    held: Sequence[int],
+    told_high: Sequence[int],
+    ground_m: float,
 ) -> _Told | None:
+    """`held`: photos with positions, of which `told_high` tell heights as well."""
     xyz, told = found.ties.xyz, _loose(found, priors, held, 3)
     loose = told * float(np.clip(_loose_ground(found, held) / told[0], 1, MOST_LOOSER))
-    above = float(np.median([priors[i].map_C[2] for i in held])) - ground_m
+    above = float(np.median([priors[i].map_C[2] for i in told_high])) - ground_m
     if not len(xyz) or not above > 1 or not loose[0] > LOOSE_SCALE:
         return None
     low, ground, top = np.quantile(xyz[:, 2], [0.16, GROUND, 0.84])
-    high = float(np.median([found.poses[i].map_C[2] for i in held]) - ground)
+    high = float(np.median([found.poses[i].map_C[2] for i in told_high]) - ground)
     if not high > 0:
         return None
     uneven = float(np.hypot(EVEN, (top - low) / (2 * high)))

@@ -78,7 +78,7 @@ class Metadata:
         if np.isfinite(level):
             z = level
         elif np.isfinite(lift):
-            z = z + lift if np.isfinite(z) else lift
+            z = z + lift
         elif not np.isfinite(z) or (datum == "takeoff" and z < 3):
             z = self.ground_at(prior.map_C) + NOMINAL_M
         R = cam_R_map_from_angles(
@@ -99,18 +99,22 @@ class Metadata:
         turn = float(np.degrees(np.angle(unit.mean()))) if agreed else 0.0
         known = np.isfinite(lifts)
         lift = float(np.median(lifts[known])) if known.any() else np.nan
-        level = float(np.median(z[known])) if _level(lifts[known], z[known]) else np.nan
+        told = np.isfinite(member.prior.map_C[2])
+        flown = z[known] if told else z
+        steady = _level(lifts[known], flown) if told else len(flown) > 0
+        level = float(np.median(flown)) if steady else np.nan
         return (turn if abs(turn) > 10 else 0.0), lift, level
 
     def _learned(self, member: Member) -> NDArray[np.float64]:
         """(3, n) of recent photos of the same source: errors of their headings (deg) when they were
-        refined, and of their heights (m), and these heights, as the map has them now.
+        refined, and of their heights (m; NaN where none is told), and these heights, as the map has
+        them now.
         """
         rows = []
         for other in self._recent[_source(member)].values():
             if other.learned is not None and other.pose is not None:
                 z, told = float(other.pose.map_C[2]), float(other.prior.map_C[2])
-                rows.append((other.learned[0], z - told if np.isfinite(told) else z, z))
+                rows.append((other.learned[0], z - told, z))
         return np.array(rows, np.float64).reshape(-1, 3).T
 
     def loose(self, member: Member, pose: Pose) -> bool:
@@ -126,8 +130,11 @@ class Metadata:
         if self.scatter() > LOOSE * above * member.photo.width / member.photo.focal.px:
             return True
         _, lifts, z = self._learned(member)
-        lifts, z = lifts[np.isfinite(lifts)], z[np.isfinite(lifts)]
-        if len(lifts) < FEWEST:
+        if np.isfinite(member.prior.map_C[2]):
+            z, lifts = z[np.isfinite(lifts)], lifts[np.isfinite(lifts)]
+        else:
+            lifts = z
+        if len(z) < FEWEST:
             return False
         return float(min(_scatter(lifts), _scatter(z))) > LOOSE_HIGH * above
 

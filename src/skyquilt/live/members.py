@@ -13,7 +13,7 @@ from pyproj import Transformer
 
 from skyquilt.alignment.local_adjustment import TURNED
 from skyquilt.alignment.priors import empty_prior, photo_prior
-from skyquilt.live.doubled import tell_doubled
+from skyquilt.live.doubled import Grounded, tell_doubled
 from skyquilt.live.failures import concerning
 from skyquilt.live.inbox import Inbox
 from skyquilt.live.ledger import DAMAGED, STAND_IN, Ledger
@@ -112,6 +112,7 @@ class Members:
         self.near: list[int] = []
         """Numbers of the photos with a position near the place where the map began, ascending."""
         self._began = np.full(3, np.nan)
+        self._grounded = Grounded(ledger)
         self._last = 0
         self._to_map: Transformer | None = None
         self._to_wgs: Transformer | None = None
@@ -140,6 +141,7 @@ class Members:
             self._began = sphere(np.array([[latitude, longitude]]))[0]
         for member in self.by_id.values():
             member.prior = self._prior(member)
+            self._note_near(member)
         self._doubt_positions(list(self.by_id.values()))
 
     def _doubt_positions(self, new: Sequence[Member]) -> None:
@@ -166,14 +168,18 @@ class Members:
         tell_doubled(self.ledger, COARSE, coarse, lambda: [f"So far: {note}" for note in notes])
 
     def _prior(self, member: Member) -> Prior:
-        """The prior of a photo in the map's frame; a position far away is not used."""
+        """The prior of a photo in the map's frame; a position far away is not used, nor a height
+        above take-off of a camera that tells none but zero.
+        """
         assert self.frame is not None
-        photo = member.photo
+        photo = self._grounded.doubted(member.photo)
         if self.distance_m(photo) > FAR_M:
             photo = replace(photo, position=None)
-        elif photo.position is not None:
-            self.near.append(member.id)
         return photo_prior(photo, self.frame, self._to_map)
+
+    def _note_near(self, member: Member) -> None:
+        if member.photo.position is not None and self.distance_m(member.photo) <= FAR_M:
+            self.near.append(member.id)
 
     def distance_m(self, photo: Photo) -> float:
         """Distance in m from a photo's position to where the map began; 0 where one of them is not
@@ -231,10 +237,15 @@ class Members:
             if self.frame is not None and state != "refused":
                 with concerning(member.id):
                     member.prior = self._prior(member)
+                    self._note_near(member)
             self.by_id[member.id] = member
             self.block_of[member.id] = member.id
             self.blocks[member.id] = {member.id}
             new.append(member)
+        risen = self._grounded.look([m.photo for m in new])
+        for member in self.by_id.values() if risen and self.frame is not None else ():
+            if member.photo.camera_key in risen:
+                member.prior = self._prior(member)
         if new and self.frame is not None:
             self._doubt_positions(new)
         return new

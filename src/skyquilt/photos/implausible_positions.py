@@ -5,7 +5,7 @@ Wrong ones are not used. Rounded and repeated ones get deviations as large as th
 do not shrink or turn a map.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -113,17 +113,34 @@ def _told(members: Sequence[Photo], far: NDArray[np.float64], main: int) -> list
     ]
 
 
+def raised(photo: Photo) -> bool:
+    """Whether a photo tells a height above take-off from which maps are made."""
+    height = photo.above_takeoff_m
+    return height is not None and abs(height) > _GROUND_M
+
+
 def without_ground_heights(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
-    """Replaces heights above take-off that stay at zero during a whole flight by heights above sea
-    level.
+    """Replaces heights above take-off that stay at zero in all photos of a camera by heights above
+    sea level.
 
     Some firmware always writes `RelativeAltitude` 0; nobody maps from below 2 m.
     """
-    heights = [h for p in photos if (h := p.above_takeoff_m) is not None]
-    if not heights or max(map(abs, heights)) > _GROUND_M:
-        return tuple(photos), ()
-    note = f"The heights above take-off stay within {_GROUND_M:.0f} m of zero and were not used."
-    return tuple(_unraised(p) for p in photos), (note,)
+    told = {p.camera_key for p in photos if p.above_takeoff_m is not None}
+    grounded = told - {p.camera_key for p in photos if raised(p)}
+    return tuple(unraised(p) if p.camera_key in grounded else p for p in photos), ground_notes(
+        {p.camera_key for p in photos}, grounded
+    )
+
+
+def ground_notes(cameras: Collection[str], grounded: Collection[str]) -> tuple[str, ...]:
+    """What is told of the cameras, of all `cameras`, whose heights above take-off stay at zero."""
+    if not grounded:
+        return ()
+    whose = "" if set(grounded) >= set(cameras) else f" of {sentence_of(sorted(grounded))}"
+    return (
+        f"The heights above take-off{whose} stay within {_GROUND_M:.0f} m of zero and were not"
+        " used.",
+    )
 
 
 def without_stuck(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
@@ -146,7 +163,8 @@ def without_stuck(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str
     return tuple(replace(p, position=None, height_m=p.above_takeoff_m) for p in photos), (note,)
 
 
-def _unraised(photo: Photo) -> Photo:
+def unraised(photo: Photo) -> Photo:
+    """The photo without its height above take-off."""
     old = photo.position
     photo = replace(photo, height_m=None)
     if old is None or old.takeoff_m is None:
