@@ -38,7 +38,8 @@ class EventEndpoints:
         """
         said = whole(request.headers.get("last-event-id", ""), 0, 2**53)
         known = after if said is None else said
-        start = self.context.survey.version() if known is None else known
+        newest = self.context.survey.version()
+        start = newest if known is None else min(known, newest)  # it may be of another survey
         return StreamingResponse(
             self._news(request, start),
             media_type="text/event-stream",

@@ -52,6 +52,7 @@ class MapEndpoints:
     def info(self) -> dict[str, Any]:
         """Describes the survey: layers with their extent in degrees, counts, number of the newest
         event. `placeless`: nothing says where the map is; its extents are where the page draws it.
+        `began`: when a live survey began (seconds since 1970), which tells it from another one.
         """
         found, placeless = [], self.context.placeless()
         for name, source in (placeless or self.context.survey.layers()).items():
@@ -74,17 +75,17 @@ class MapEndpoints:
             if isinstance(self.context.survey, LiveSurvey)
             else {}
         )
-        finish = (
-            self.context.survey.ledger.meta("finish")
-            if isinstance(self.context.survey, LiveSurvey)
-            else None
-        )
+        finish = began = None
+        if isinstance(self.context.survey, LiveSurvey):
+            ledger = self.context.survey.ledger
+            finish, began = ledger.meta("finish"), real(ledger.meta("began"))
         return {
             "layers": found,
             "placeless": bool(placeless),
             "growing": self.context.survey.growing and self.context.writer is not None,
             "counts": counts,
             "event": self.context.survey.version(),
+            "began": began,
             "version": __version__,
             "token": self.context.guard.token is not None,
             "finish": finish,

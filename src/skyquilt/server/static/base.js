@@ -41,9 +41,14 @@ const PATIENCE_MS = 60000;
 const asked = async (url, options) => {
   const answer = await fetch(url, options || { signal: AbortSignal.timeout(PATIENCE_MS) }).catch(() => { throw new Error("the server does not answer"); });
   const said = await answer.json().catch(() => ({}));
-  if (!answer.ok) throw new Error(typeof said.detail === "string" ? said.detail : `the server answers ${answer.status}`);
+  if (!answer.ok) throw Object.assign(new Error(typeof said.detail === "string" ? said.detail : `the server answers ${answer.status}`), { refused: answer.status < 500 && ![408, 425, 429].includes(answer.status) });
   return said;
 };
+// What does not come over a weak link, and was not refused, is read again later, by its name (`readMissed`).
+const missed = new Map();
+const surely = (name, read) => { missed.delete(name); return read().catch((error) => { if (!error.refused) missed.set(name, read); throw error; }); };
+const quietly = (name, read) => surely(name, read).catch(() => {});
+const readMissed = () => { for (const [name, read] of [...missed]) quietly(name, read); };
 const inSize = (n) => n > 1e6 ? `${(n / 1e6).toFixed(1)} MB` : `${Math.max(1, Math.round(n / 1e3))} kB`;
 const saveText = (name, text) => {
   const a = element("a");

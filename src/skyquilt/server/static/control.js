@@ -10,7 +10,7 @@ const controlLayer = L.layerGroup().addTo(map);
 const readControl = async () => {
   if (!state.info || !state.info.control || control.read) return;
   control.read = true;
-  const said = await asked("control");
+  const said = await asked("control").catch((error) => { control.read = false; throw error; });
   Object.assign(control, { crs: said.crs, points: said.points, marks: said.marks, run: said.run, photos: said.photos });
   $("control").hidden = false;
   drawControl();

@@ -18,10 +18,10 @@ const drawOverlay = (name, data) => {
   }));
 };
 const showOverlay = async (name) => {
-  const answer = await fetch(`layers/${encodeURIComponent(name)}`);
-  drawOverlay(name, answer.ok ? await answer.json() : null);
+  const data = await asked(`layers/${encodeURIComponent(name)}`, {}).catch((error) => { if (error.refused) return null; throw error; });
+  drawOverlay(name, data);
 };
-const readOverlays = async () => { for (const { name } of (await asked("layers")).layers) await showOverlay(name); };
+const readOverlays = async () => { for (const { name } of (await asked("layers")).layers) await quietly(`layer ${name}`, () => showOverlay(name)); };
 const showHere = async (file) => {
   try {
     const data = JSON.parse(await file.text());
@@ -31,10 +31,11 @@ const showHere = async (file) => {
   } catch (error) { say(`${file.name} is not GeoJSON (${error.message})`); }
 };
 const handIn = async (files) => {
+  if (!state.info) { say("the server does not answer"); return; }
   const photos = [];
   for (const file of files) {
     const plain = /\.(geo)?json$/i.test(file.name), layer = plain || /\.(kml|kmz|gpkg|zip)$/i.test(file.name);
-    if (!state.info || !state.info.growing) {
+    if (!state.info.growing) {
       if (plain) await showHere(file);
       else if (!(await handControl(file))) say(`${file.name}: here, GeoJSON and lists of control points can be shown`);
       continue;

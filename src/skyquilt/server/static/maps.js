@@ -17,8 +17,11 @@ const Growing = L.GridLayer.extend({
     return img;
   },
   fill(img, { x, y, z }, empty) {
+    // one at a time: an answer that comes late must not replace a newer one, and a flood of changes is one request
+    if (img.asking) { img.changed = true; return; }
     const url = `tiles/${z}/${x}/${y}?layer=${encodeURIComponent(this.options.layer)}`;
-    img.lost = false;
+    img.asking = true;
+    img.lost = img.changed = false;
     fetch(url, { signal: AbortSignal.timeout(PATIENCE_MS) }).then((r) => {
       if (!r.ok && r.status !== 404) throw new Error(r.status);
       return r.status === 200 ? r.blob() : null;
@@ -27,7 +30,10 @@ const Growing = L.GridLayer.extend({
       const address = URL.createObjectURL(blob), next = new Image();
       next.onload = () => { img.src = address; img.style.visibility = "inherit"; setTimeout(() => URL.revokeObjectURL(address), 1000); if (!empty) window.drawnTiles = (window.drawnTiles || 0) + 1; };
       next.src = address;
-    }).catch(() => { img.lost = true; });  // not done: what was shown there before stays
+    }).catch(() => { img.lost = true; }).then(() => {  // not done: what was shown there before stays
+      img.asking = false;
+      if (img.changed && img.isConnected) this.fill(img, { x, y, z }, img.lost ? img.empty : null);
+    });
   },
   // What did not come over a weak link is asked for again.
   again() { for (const { el, coords } of Object.values(this._tiles)) if (el.lost) this.fill(el, this._wrapCoords(coords), el.empty); },

@@ -52,9 +52,12 @@ const listPhotos = () => {
 let listing = null;
 const listSoon = () => { if (!listing) listing = setTimeout(() => { listing = null; listPhotos(); }, 250); };
 const readPhotos = async () => {
+  const meanwhile = state.meanwhile = [];  // news that come during a slow answer may not be in it
   const said = await asked("photos");
   state.photos = new Map(said.photos.map((p) => [p.id, p]));
   state.refused = said.refused;
+  if (state.meanwhile === meanwhile) state.meanwhile = null;
+  meanwhile.forEach(photoNews);
   listPhotos();
 };
 $("time").oninput = listPhotos;

@@ -50,9 +50,7 @@
   };
   const minutes = (s) => `${Math.floor(s / 60)}:${String(Math.round(s % 60)).padStart(2, "0")}`;
   const read = async () => {
-    const answer = await fetch("plan");
-    if (!answer.ok) { section.hidden = true; return; }
-    const told = await answer.json(), key = JSON.stringify(told.plan && [told.plan.points.length, told.plan.points[0]]);
+    const told = await asked("plan").catch((error) => { section.hidden ||= error.refused; throw error; }), key = JSON.stringify(told.plan && [told.plan.points.length, told.plan.points[0]]);
     if (key !== known) { known = key; draw(told.plan, told.states); } else turn(told.states);
     legend.hidden = showPoints.hidden = fill.hidden = !told.plan;
     drones.replaceChildren(...told.drones.map((d) => make("li", `${d.name}: ${d.taken} of ${d.planned} photos, ${minutes(d.seconds_left)} left`)));
@@ -69,9 +67,7 @@
     }));
   };
   const readCover = async () => {
-    const answer = await fetch("coverage");
-    if (!answer.ok) return;
-    const told = await answer.json();
+    const told = await asked("coverage");
     share.textContent = told.bounds ? `${(100 * told.share).toFixed(1)} % of the area has ${told.views} views` : "";
     sharing = told;
     if (cover) { cover.remove(); cover = null; }
@@ -80,8 +76,8 @@
       cover = L.imageOverlay(`coverage.png?v=${Date.now()}`, [[south, west], [north, east]], { opacity: 0.75, zIndex: 260, interactive: false }).addTo(map);
     }
   };
-  const soon = (work, wait) => { let t = null; return () => { if (!t) t = setTimeout(() => { t = null; work().catch(() => {}); }, wait); }; };
-  const readSoon = soon(read, 300), coverSoon = soon(readCover, 600);
+  const soon = (name, work, wait) => { let t = null; return () => { if (!t) t = setTimeout(() => { t = null; quietly(name, work); }, wait); }; };
+  const readSoon = soon("plan", read, 300), coverSoon = soon("coverage", readCover, 600);
   showPoints.onclick = () => { const on = showPoints.getAttribute("aria-pressed") !== "true"; showPoints.setAttribute("aria-pressed", String(on)); for (const l of [points, ways]) on ? l.addTo(map) : l.remove(); };
   showCover.onclick = () => { showCover.setAttribute("aria-pressed", String(showCover.getAttribute("aria-pressed") !== "true")); coverSoon(); };
 
@@ -89,9 +85,9 @@
   let shapes = [], open = null;
   const collection = () => ({ type: "FeatureCollection", features: shapes.map((s) => ({ type: "Feature", properties: s.closed ? { keep_out: true } : {}, geometry: { type: "Polygon", coordinates: [[...s.ring, s.ring[0]].map(([y, x]) => [x, y])] } })) });
   const readAreas = async () => {
-    const answer = await fetch("areas");
-    if (!answer.ok || open) return;
-    const polygons = (await answer.json()).features.filter((f) => f.geometry.type === "Polygon");
+    const told = await asked("areas");
+    if (open) return;
+    const polygons = told.features.filter((f) => f.geometry.type === "Polygon");
     shapes = polygons.map((f) => ({ closed: Boolean(f.properties.keep_out), ring: f.geometry.coordinates[0].slice(0, -1).map(([x, y]) => [y, x]) }));
     show();
   };
@@ -149,12 +145,10 @@
   };
   fill.onclick = () => sent("plan/missing", "");
   const ready = async (name) => {
-    const answer = await fetch(`plans/${encodeURIComponent(name)}/points.geojson`);
-    if (!answer.ok) return;
-    const ways = await (await fetch(`plans/${encodeURIComponent(name)}/routes.geojson`)).json();
+    const [places, ways] = await Promise.all(["points", "routes"].map((what) => asked(`plans/${encodeURIComponent(name)}/${what}.geojson`)));
     follow.clearLayers();
     L.geoJSON(ways, { style: { color: "#7c3aed", weight: 2 }, interactive: false }).addTo(follow);
-    L.geoJSON(await answer.json(), { pointToLayer: (f, p) => L.circleMarker(p, { radius: 5, color: "#7c3aed", weight: 2, fillOpacity: 0.4, interactive: false }) }).addTo(follow);
+    L.geoJSON(places, { pointToLayer: (f, p) => L.circleMarker(p, { radius: 5, color: "#7c3aed", weight: 2, fillOpacity: 0.4, interactive: false }) }).addTo(follow);
   };
 
   // -- photos placed by their metadata alone: pale, with a dashed outline, until they are refined
@@ -174,16 +168,16 @@
   // -- news
   document.addEventListener("plan", ({ detail: told }) => {
     if (told.text) said.textContent = told.text;
-    if (told.state === "ready") ready(told.name).catch(() => {});
+    if (told.state === "ready") quietly("plan made", () => ready(told.name));
     readSoon();
   });
   document.addEventListener("coverage", coverSoon);
-  document.addEventListener("areas", () => readAreas().catch(() => {}));
+  document.addEventListener("areas", () => quietly("areas", readAreas));
   // a finished map has no plan
   section.hidden = true;
   document.addEventListener("connected", () => {
     section.hidden = !state.info || !state.info.growing;
-    if (!section.hidden) read().then(readCover).then(readAreas).catch(() => {});
+    for (const [name, work] of section.hidden ? [] : [["plan", read], ["coverage", readCover], ["areas", readAreas]]) quietly(name, work);
   });
   show();
   window.skyquilt.plan = { shapes: () => shapes, marks, cover: () => sharing, provisional };

@@ -1,7 +1,9 @@
 "use strict";
 // What the survey says of itself, and news while it grows.
 const readInfo = async () => {
-  const info = await asked("info"), finished = !info.growing;
+  const info = await asked("info"), finished = !info.growing, survey = `${info.title} ${info.began}`;
+  if (state.survey !== undefined && state.survey !== survey) { otherSurvey(); return; }
+  state.survey = survey;
   const done = state.info && state.info.finish !== "done" && info.finish === "done";
   // a map that gets its place, or loses it, lies elsewhere in the page
   if (state.info && state.info.placeless !== info.placeless) state.fitted = false;
@@ -23,7 +25,13 @@ const readInfo = async () => {
   follow();
   explain();
   readMeasures();
+  if (!gone && news) showLink();
   if (done) await openFinal();
+};
+// The server was started for another survey: nothing that is shown here belongs to it.
+const otherSurvey = () => {
+  if (!sending.now) { location.reload(); return; }
+  $("stale").textContent = "The server shows another survey now, this page the former one. Reload it once all is sent.";
 };
 // How many photos are in which state, and, while the map grows, when the last one came.
 const showCounts = () => {
@@ -35,13 +43,13 @@ const showCounts = () => {
 document.addEventListener("photoslisted", () => { if (state.info) showCounts(); });
 // After the flight: the final map is opened, with its files.
 const openFinal = async () => {
-  if (!state.layers.has("finished")) return readFiles();  // of photos without positions
+  if (!state.layers.has("finished")) return quietly("files", readFiles);  // of photos without positions
   $("layer").value = "finished";
   $("layer").onchange();
   const everywhere = [L.latLngBounds([-90, -180], [90, 180])];
   for (const layer of [first, second]) if (layer && layer.options.layer.startsWith("finished")) layer.refresh(everywhere);
   fit();
-  await readFiles();
+  await quietly("files", readFiles);
 };
 // Instead of an empty map: what is missing, and what to do.
 const explain = () => {
@@ -69,10 +77,11 @@ const explain = () => {
   $("empty").replaceChildren(element("h2", head), element("p", text));
 };
 let again = null;
-const readInfoSoon = () => { if (!again) again = setTimeout(() => { again = null; readInfo().catch(() => {}); }, 400); };
+const readInfoSoon = () => { if (!again) again = setTimeout(() => { again = null; quietly("info", readInfo); }, 400); };
 
 const told = (kind, use) => (e) => { heard = Date.now(); state.last = Math.max(state.last, Number(e.lastEventId) || 0); use(JSON.parse(e.data)); };
 const photoNews = (p) => {
+  if (state.meanwhile) state.meanwhile.push(p);
   const known = state.photos.get(p.id) || {}, { time, ...rest } = p;
   state.photos.set(p.id, { received: Date.now() / 1000, ...known, ...(p.state !== known.state ? { reason: "" } : {}), ...rest, time: known.time || (time ? Date.parse(/[zZ]|[+-]\d\d:?\d\d$/.test(time) ? time : `${time}Z`) / 1000 : null) });
   listSoon(); readInfoSoon();
@@ -94,11 +103,14 @@ const back = () => {
   heard = Date.now();
   if (gone) say("Connected again.");
   gone = false;
+  $("stale").textContent = "";
+  showLink();
+  mend();
+  catchUp();
+};
+const showLink = () => {
   $("link").textContent = state.info && state.info.growing ? "live" : "open";
   $("link").className = "live";
-  $("stale").textContent = "";
-  mend();
-  catchUp().then(() => document.dispatchEvent(new Event("connected")));
 };
 const listen = () => {
   if (news) news.close();
@@ -114,7 +126,7 @@ const listen = () => {
     readInfoSoon();
     for (const layer of [first, second]) if (layer && layer.options.layer === t.layer) layer.refresh(boxes);
   }));
-  news.addEventListener("layer", told("layer", (l) => showOverlay(l.name)));
+  news.addEventListener("layer", told("layer", (l) => quietly(`layer ${l.name}`, () => showOverlay(l.name))));
   news.addEventListener("refused", told("refused", (r) => { (state.refused = state.refused || []).unshift(r); listSoon(); readInfoSoon(); }));
   news.addEventListener("finish", told("finish", (f) => { say(f.text || `final map: ${f.state}`); readInfoSoon(); }));
   news.addEventListener("map", told("map", readInfoSoon));
@@ -122,12 +134,17 @@ const listen = () => {
 const watch = () => {
   if (!news) return;
   if (news.readyState === 2 || Date.now() - Math.max(heard, tried) > SILENT_MS) { lost(); listen(); }
-  else if (!gone && Date.now() - mended > 10000) mend();
+  else if (!gone && Date.now() - mended > 10000) { mend(); readMissed(); }
 };
 setInterval(watch, 2000);
 document.addEventListener("visibilitychange", watch);  // a phone that was locked
 window.addEventListener("online", () => { gone ? listen() : mend(); });
-const catchUp = () => Promise.all([readInfo(), readPhotos(), readOverlays(), readFiles(), readControl()]).catch(() => {});
+const catchUp = () => quietly("all", async () => {
+  const parts = [quietly("photos", readPhotos), quietly("layers", readOverlays), quietly("files", readFiles)];
+  await readInfo();
+  await Promise.all([...parts, quietly("control", readControl)]);
+  document.dispatchEvent(new Event("connected"));
+});
 // Not before all scripts of the page are there: what one of them waits for must not have happened before it listens.
 document.addEventListener("DOMContentLoaded", () => { readInfo().catch(() => say("the server does not answer")).then(listen); });
 window.skyquilt = { map, state };
