@@ -110,12 +110,12 @@ const showBig = async (p, at) => {
   sheet.setAttribute("aria-label", "photo: arrow keys move it");
   box.replaceChildren(head, sheet);
   if (!box.open) box.showModal();
-  const place = await asked(`photos/${p.id}/place?lon=${at.lng}&lat=${at.lat}`).catch(() => null);
-  if (!place) return;
-  const ring = element("i", undefined, "spot");
-  ring.style.left = `${100 * (place.x + 0.5) / place.width}%`;
-  ring.style.top = `${100 * (place.y + 0.5) / place.height}%`;
-  sheet.append(ring);
-  const centre = () => ring.scrollIntoView({ block: "center", inline: "center" });
-  img.complete ? centre() : (img.onload = centre);
+  await quietly("place", async () => {
+    const place = await asked(`photos/${p.id}/place?lon=${at.lng}&lat=${at.lat}`), ring = element("i", undefined, "spot");
+    ring.style.left = `${100 * (place.x + 0.5) / place.width}%`;
+    ring.style.top = `${100 * (place.y + 0.5) / place.height}%`;
+    sheet.append(ring);
+    const centre = () => ring.scrollIntoView({ block: "center", inline: "center" });
+    img.complete ? centre() : (img.onload = centre);
+  });
 };
