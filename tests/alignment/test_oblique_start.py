@@ -7,13 +7,14 @@ import pytest
 
 from skyquilt.alignment import oblique_start
 from skyquilt.alignment.bundle import Bundle
-from skyquilt.alignment.oblique_guess import LOWERED, guessed_priors, lowered
+from skyquilt.alignment.oblique_guess import LOWERED, guessed_priors, lowered, misled
 from skyquilt.alignment.oblique_start import (
     aslant,
     nearer,
     reported_start,
     slanting,
     tilt_warnings,
+    turned_aside,
     turned_priors,
     within_noise,
 )
@@ -298,9 +299,11 @@ def test_photos_that_an_adjustment_turned_are_taken_to_report_that():
     assert tilt_warnings(flown.priors, found) == []
     turned = turned_priors(found, level)
     assert slanting(turned)
+    aside = turned_aside(found, level)  # positions of 1.5 m, 40 m from their middle
+    assert np.degrees(np.arccos((np.trace(aside) - 1) / 2)) < 3.0
     for i, p in enumerate(turned):
         R = cam_R_map_from_angles(p.yaw_deg, p.pitch_deg, p.roll_deg)
-        assert found.poses[i].cam_R_map == pytest.approx(R, abs=1e-9)
+        assert found.poses[i].cam_R_map @ aside.T == pytest.approx(R, abs=1e-9)
     (says,) = tilt_warnings(level, found)
     assert "none reports its camera angles" in says
     nowhere = [replace(p, map_C=np.full(3, np.nan)) for p in level]
@@ -407,6 +410,40 @@ def test_photos_without_angles_are_guessed_to_look_at_the_middle():
     found = flown.aligned()
     assert len(found.held) == len(flown.photos)
     assert np.median(flown.errors(found)[0]) < 2.0
+
+
+@pytest.mark.parametrize("pitch", [30, pytest.param(20, marks=pytest.mark.slow)])
+def test_tilts_that_all_photos_have_in_common_are_found(pitch):
+    """Without camera angles they were taken to look down, and the map was tilted in their place."""
+    lines = [
+        ((-28, -14, 0, 14, 28)[:: 1 - 2 * (k % 2)], y) for k, y in enumerate((-30, -10, 10, 30))
+    ]
+    headings = (90.0, 270.0, 90.0, 270.0)
+    places = [
+        (x, y, 50.0, h, pitch) for (xs, y), h in zip(lines, headings, strict=True) for x in xs
+    ]
+    flown = Slanting(places, seed=2, alike_deg=180)
+    flown.priors = [
+        replace(p, yaw_deg=np.nan, sigma_C=np.array([5.0, 5.0, 15.0])) for p in untold_tilts(flown)
+    ]
+    found = flown.aligned()
+    assert len(found.held) == len(flown.photos)
+    assert np.median(flown.errors(found)[0]) < 2.0
+    tilts = [np.degrees(np.arccos(-p.cam_R_map[2, 2])) for p in found.poses.values()]
+    assert np.median(tilts) == pytest.approx(pitch, abs=3.0)
+    assert tilt_warnings(flown.priors, found)
+
+
+def test_heights_that_drift_tilt_no_photo():
+    """They are uneven as those of photos that look aslant are, and nearer to many a false tilt."""
+    flown = Slanting([(x, y, 45.0, 0.0, 0.0) for y in (-36, -12, 12, 36) for x in (-27, -9, 9, 27)])
+    level = [replace(p, yaw_deg=np.nan) for p in untold_tilts(flown)]
+    flown.priors = [replace(p, map_C=p.map_C + (0, 0, 1.5 * k)) for k, p in enumerate(level)]
+    found = flown.aligned()
+    assert misled(found, flown.priors, len(flown.photos))
+    tilts = [np.degrees(np.arccos(-p.cam_R_map[2, 2])) for p in found.poses.values()]
+    assert np.median(tilts) < 4.0
+    assert tilt_warnings(flown.priors, found) == []
 
 
 def test_what_photos_report_is_kept_where_no_guess_is_clearly_better():

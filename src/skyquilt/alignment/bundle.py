@@ -115,8 +115,9 @@ class Bundle:
             own = enlarged(begun)
             return self._block(own, frame, begun, features, upright, control, grey, part, make_room)
 
-        def guess(begun: Beginning) -> Sequence[Prior] | None:
-            return guessed_priors(enlarged(begun), begun.priors, features, links)
+        def guess(tried: Tried) -> Sequence[Prior] | None:
+            own = enlarged(tried.begun)
+            return guessed_priors(own, tried.begun.priors, features, links, tried.found)
 
         def priors_of(tried: Tried) -> CameraPriors:
             return priors_by_camera(enlarged(tried.begun), self.distortion)

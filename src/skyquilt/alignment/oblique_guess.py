@@ -1,8 +1,9 @@
 """Guessed directions for oblique surveys whose photos do not tell them, or tell them falsely.
 
-Photos taken around something look at the middle of their positions; headings that are false are
-usually so by the same angle in all photos. Of such guesses the one is taken with which rays of
-matched keypoints meet: the epipolar constraint, with reported positions.
+Photos taken around something look at the middle of their positions; cameras that are mounted
+aslant, or held so out of a window, are tilted alike in all photos; headings that are false are
+usually so by the same angle. Of such guesses the one is taken with which rays of matched keypoints
+meet: the epipolar constraint, with reported positions.
 """
 
 from collections.abc import Iterator, Sequence
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.determined import STATED_DEG
 from skyquilt.alignment.oblique import OBLIQUE_DEG, tilt_deg, tilts_reported
-from skyquilt.alignment.oblique_start import off_positions, slanting, turned_far
+from skyquilt.alignment.oblique_start import as_found, off_positions, slanting, turned_far
 from skyquilt.geometry.frames import angles_from_cam_R_map, cam_R_map_from_angles
 from skyquilt.matching.lens_kind import as_pinhole
 from skyquilt.model.features import Features, Link
@@ -41,6 +42,19 @@ TILTS_DEG = (40, 45, 50, 55, 60, 65, 70, 75)
 """Tilts that are tried where none is reported, all oblique ones: the adjustment finds the rest."""
 LEVEL_DEG, NEARLY_ALL = 70.0, 0.9
 """A photo that reports a larger tilt looks at the horizon; and the share of photos that must."""
+FEWEST_UNEVEN, UNEVEN = 5, 0.05
+"""So many photos without camera angles whose heights over those reported vary by more than this
+share of their height above the ground (RMS) may be tilted alike.
+"""
+ALIKE_DEG, ROUND_DEG, FINER_DEG = (12, 20, 28, 36, 44, 52, 60), 30, (4.0, 2.0, 1.0)
+"""Tilts that are then tried, in directions so far apart, and steps by which the best one is moved.
+"""
+ABOUT_AS_WELL = 1.1
+"""The best one is adjusted where rays miss by no more than this times what they miss by as found:
+errors of positions hide what 20 degrees of tilt are worth, and the adjustment does not.
+"""
+BETTER = 0.9
+"""Residuals of photos that look aslant fall below this share with about their tilts, and to a half."""
 TURN_DEG = 15
 """Headings are turned by multiples of this angle."""
 
@@ -72,13 +86,33 @@ def misled(found: Alignment, priors: Sequence[Prior], linked: int) -> bool:
     if tilts_reported(priors):
         return slanting(priors)
     lost = len(found.held) < (1 - LOST) * linked
-    return lost or far_off(found, priors) or turned_far(found, priors)
+    return lost or far_off(found, priors) or turned_far(found, priors) or uneven(found, priors)
+
+
+def uneven(found: Alignment, priors: Sequence[Prior]) -> bool:
+    """Whether heights of photos over those that they report vary far more than barometers err."""
+    z = np.array([found.poses[i].map_C[2] for i in found.held])
+    off = z - [priors[i].map_C[2] for i in found.held]
+    off = off[np.isfinite(off)]
+    if len(off) < FEWEST_UNEVEN:
+        return False
+    return bool(np.std(off) > UNEVEN * float(np.median(z) - found.ground_m))
 
 
 def far_off(found: Alignment, priors: Sequence[Prior], times: float = OFF) -> bool:
     """Whether photos lie further from their positions than so many deviations of these (median)."""
     sigma = np.median([float(np.linalg.norm(priors[i].sigma_C)) for i in found.held] or [np.inf])
     return bool(off_positions(found, priors) > times * sigma)
+
+
+def better_seen(guessed: Alignment, found: Alignment, priors: Sequence[Prior]) -> bool:
+    """Whether an adjustment by guessed tilts fits the pictures clearly better, or holds clearly more
+    photos: positions that err are nearer to many a false tilt (a barometer that drifts).
+    """
+    if tilts_reported(priors) or (1 - LOST) * len(guessed.held) > len(found.held):
+        return True
+    missed = [np.linalg.norm(a.ties.residual_px, axis=1) for a in (guessed, found)]
+    return bool(np.median(missed[0]) < BETTER * np.median(missed[1]))
 
 
 def agrees(guessed: Alignment, found: Alignment) -> bool:
@@ -93,18 +127,54 @@ def guessed_priors(
     priors: Sequence[Prior],
     features: Sequence[Features],
     links: Sequence[Link],
+    found: Alignment | None = None,
 ) -> list[Prior] | None:
     """Priors with the directions with which matched rays meet best; None where no guess is clearly
-    better than what the photos report.
+    better than what the photos report. `found`: an adjustment as if photos without camera angles
+    looked down; it tells their headings, and tilts that all have in common are guessed, too.
     """
     rays = _rays(photos, priors, features, links)
     if rays is None:
         return None
-    best, least = None, CLEARER * _miss(rays, priors)
+    best, least = None, CLEARER * _miss(rays, _rotations(priors))
+    if found is not None and not tilts_reported(priors):
+        best, least = _tilted_alike(rays, priors, found)
+        if not (far_off(found, priors) or turned_far(found, priors)):
+            return best
     for guess in _guesses(priors):
-        if (miss := _miss(rays, guess)) < least:
+        if (miss := _miss(rays, _rotations(guess))) < least:
             best, least = guess, miss
     return best
+
+
+def _tilted_alike(
+    rays: _Rays, priors: Sequence[Prior], found: Alignment
+) -> tuple[list[Prior] | None, float]:
+    """Priors of photos that are tilted alike, with the headings that an adjustment found, or turned
+    with it as a whole to where they report to be, and by what rays miss one another; None, and
+    infinity, where that is more than with what was found.
+    """
+    level, own = np.full((2, len(priors), 3, 3), np.nan)
+    yaws = dict[int, float]()
+    for i in found.held:
+        own[i] = found.poses[i].cam_R_map
+        yaws[i] = angles_from_cam_R_map(own[i])[0]
+        level[i] = cam_R_map_from_angles(yaws[i])
+
+    def missed(tilt: tuple[float, float]) -> float:
+        return _miss(rays, cam_R_map_from_angles(0.0, *tilt) @ cam_R_map_from_angles(0.0).T @ level)
+
+    turns = np.radians(np.arange(0, 360, ROUND_DEG))
+    tilts = [(t * np.cos(a), t * np.sin(a)) for t in ALIKE_DEG for a in turns.tolist()]
+    least, best = min((missed(tilt), tilt) for tilt in tilts)
+    for step in FINER_DEG:
+        around = [(best[0] + step * i, best[1] + step * j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+        least, best = min((missed(tilt), tilt) for tilt in around)
+    guess = [_looking(p, yaws.get(i, np.nan), *best) for i, p in enumerate(priors)]
+    turned = as_found(found, priors)
+    if (whole := _miss(rays, _rotations(turned))) < least:
+        guess, least = turned, whole
+    return (guess, least) if least < ABOUT_AS_WELL * _miss(rays, own) else (None, np.inf)
 
 
 def lowered(found: Alignment, priors: Sequence[Prior]) -> Sequence[Prior]:
@@ -156,12 +226,12 @@ def _lowered(prior: Prior) -> Prior:
     return replace(prior, yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll)
 
 
-def _looking(prior: Prior, yaw_deg: float, tilt_deg: float) -> Prior:
+def _looking(prior: Prior, yaw_deg: float, pitch_deg: float, roll_deg: float = 0.0) -> Prior:
     return replace(
         prior,
         yaw_deg=yaw_deg,
-        pitch_deg=tilt_deg,
-        roll_deg=0.0,
+        pitch_deg=pitch_deg,
+        roll_deg=roll_deg,
         sigma_yaw_deg=STATED_DEG,
         sigma_tilt_deg=STATED_DEG,
     )
@@ -204,11 +274,15 @@ def _local(photo: Photo, px: NDArray[np.floating]) -> Array:
     return np.asarray(local / np.linalg.norm(local, axis=1, keepdims=True))
 
 
-def _miss(rays: _Rays, priors: Sequence[Prior]) -> float:
-    """Median angle in rad by which rays miss one another; a right angle where they meet behind a
-    camera. Infinite without headings.
+def _rotations(priors: Sequence[Prior]) -> Array:
+    """(n, 3, 3) from map to camera as photos report, NaN without headings."""
+    return np.array([cam_R_map_from_angles(p.yaw_deg, p.pitch_deg, p.roll_deg) for p in priors])
+
+
+def _miss(rays: _Rays, R: Array) -> float:
+    """Median angle in rad by which rays miss one another with rotations (n, 3, 3) from map to
+    camera; a right angle where they meet behind a camera. Infinite where most are not known.
     """
-    R = np.array([cam_R_map_from_angles(p.yaw_deg, p.pitch_deg, p.roll_deg) for p in priors])
     u = np.einsum("nji,nj->ni", R[rays.a], rays.from_a)
     v = np.einsum("nji,nj->ni", R[rays.b], rays.from_b)
     normal = np.cross(u, v)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.control import fit_similarity_3d
 from skyquilt.alignment.determined import STATED_DEG
 from skyquilt.alignment.oblique import (
     MOST_OBLIQUE,
@@ -50,6 +51,10 @@ FEWEST_CROWDED = 4
 """Photos with positions that are needed to judge whether these crowd in one place: ..."""
 CROWDED = 5.0
 """... half of them lie within so many of their deviations of their middle."""
+WIDE = 2.0
+"""Least spread of positions across their main direction, in their deviations (RMS), that tells how
+all are turned about it.
+"""
 FEWEST_MET = 50
 """Fewest such pairs of rays that tell the height of the ground."""
 
@@ -119,7 +124,7 @@ def untold(priors: Sequence[Prior]) -> frozenset[int]:
 
 def turned_far(found: Alignment, priors: Sequence[Prior]) -> bool:
     """Whether an adjustment turned most photos far from the vertical, and none reports its tilt."""
-    far = sum(tilt_deg(found.poses[i].cam_R_map) > OBLIQUE_DEG for i in found.held)
+    far = sum(tilt_deg(found.poses[i].cam_R_map) > VERTICAL_DEG for i in found.held)
     return not tilts_reported(priors) and far > MOST_OBLIQUE * len(found.held)
 
 
@@ -157,9 +162,16 @@ def turned_priors(found: Alignment, priors: Sequence[Prior]) -> list[Prior] | No
     """
     if not turned_far(found, priors) or not np.isfinite(off_positions(found, priors)):
         return None
-    turned = list(priors)
+    return as_found(found, priors)
+
+
+def as_found(found: Alignment, priors: Sequence[Prior]) -> list[Prior]:
+    """Priors of photos that are taken to report the directions that an adjustment found, turned
+    as a whole to where photos lie as they report.
+    """
+    turned, aside = list(priors), turned_aside(found, priors)
     for i in found.held:
-        yaw, pitch, roll = angles_from_cam_R_map(found.poses[i].cam_R_map)
+        yaw, pitch, roll = angles_from_cam_R_map(found.poses[i].cam_R_map @ aside.T)
         turned[i] = replace(
             priors[i],
             yaw_deg=yaw,
@@ -169,6 +181,22 @@ def turned_priors(found: Alignment, priors: Sequence[Prior]) -> list[Prior] | No
             sigma_tilt_deg=STATED_DEG,
         )
     return turned
+
+
+def turned_aside(found: Alignment, priors: Sequence[Prior]) -> Array:
+    """(3, 3) rotation of an adjustment as a whole by which photos come nearest to the positions that
+    they report; none where these lie about in a line.
+    """
+    held = [i for i in found.held if np.isfinite(priors[i].map_C).all()]
+    if len(held) < FEWEST_CROWDED:
+        return np.eye(3)
+    C = np.array([found.poses[i].map_C for i in held])
+    there = np.array([priors[i].map_C for i in held])
+    C, there = C - C.mean(0), there - there.mean(0)
+    wide = np.linalg.svd(there, compute_uv=False)[1] / np.sqrt(len(held))
+    if not wide > WIDE * float(np.median([priors[i].sigma_C[0] for i in held])):
+        return np.eye(3)
+    return fit_similarity_3d(C, there)[1]
 
 
 def off_positions(found: Alignment, priors: Sequence[Prior]) -> float:

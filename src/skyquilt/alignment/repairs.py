@@ -16,7 +16,7 @@ from skyquilt.alignment.false_tilts import told_no_tilt
 from skyquilt.alignment.late_positions import as_moved, mirrored, moved_note, on_time, unshifted
 from skyquilt.alignment.motion import Speeds
 from skyquilt.alignment.oblique import reported_oblique, turned_deg, without_photos
-from skyquilt.alignment.oblique_guess import agrees, far_off, lowered, misled
+from skyquilt.alignment.oblique_guess import agrees, better_seen, far_off, lowered, misled
 from skyquilt.alignment.oblique_start import (
     Beginnings,
     aslant,
@@ -103,7 +103,7 @@ class Survey:
     """Names of those whose photos may have been cut off (`cut_cameras`)."""
     beginnings: Callable[[Tried], Beginnings]
     """Where photos begin in space (`oblique_start.beginnings`)."""
-    guess: Callable[[Beginning], Sequence[Prior] | None]
+    guess: Callable[[Tried], Sequence[Prior] | None]
     """Priors with directions with which matched rays meet clearly better; None without any."""
 
     def tried(self, begun: Beginning, **changes: Any) -> Tried:
@@ -227,11 +227,12 @@ def _guessed_directions(last: Tried, survey: Survey) -> Tried:
     priors = last.begun.priors
     if not misled(last.found, priors, survey.linked):
         return last
-    guess = survey.guess(last.begun)
+    guess = survey.guess(last)
     if guess is None:
         return last
     other = survey.tried(last.begun, guess=guess, aside=untold(guess), name="guessed ")
-    if nearer(other.found, last.found, priors) and agrees(other.found, last.found):
+    fits = better_seen(other.found, last.found, priors) and agrees(other.found, last.found)
+    if fits and nearer(other.found, last.found, priors):
         return replace(other, notes=last.notes)
     return last
 
