@@ -54,7 +54,9 @@ ABOUT_AS_WELL = 1.1
 errors of positions hide what 20 degrees of tilt are worth, and the adjustment does not.
 """
 BETTER = 0.9
-"""Residuals of photos that look aslant fall below this share with about their tilts, and to a half."""
+"""Residuals of photos that look aslant fall below this share with about their tilts."""
+ONE_SIDE = 0.7
+"""Length of the mean of unit vectors in which photos look ahead that look to one side."""
 TURN_DEG = 15
 """Headings are turned by multiples of this angle."""
 
@@ -105,14 +107,21 @@ def far_off(found: Alignment, priors: Sequence[Prior], times: float = OFF) -> bo
     return bool(off_positions(found, priors) > times * sigma)
 
 
-def better_seen(guessed: Alignment, found: Alignment, priors: Sequence[Prior]) -> bool:
-    """Whether an adjustment by guessed tilts fits the pictures clearly better, or holds clearly more
-    photos: positions that err are nearer to many a false tilt (a barometer that drifts).
+def believable(guessed: Alignment, found: Alignment, priors: Sequence[Prior]) -> bool:
+    """Whether more than heights speaks for an adjustment by guessed tilts: those of a barometer
+    that drifts are uneven, too, and nearer to many a false tilt. It holds clearly more photos, fits
+    the pictures clearly better, or lies far nearer to positions with photos that look to many
+    sides: no barometer drifts as a drone turns.
     """
     if tilts_reported(priors) or (1 - LOST) * len(guessed.held) > len(found.held):
         return True
     missed = [np.linalg.norm(a.ties.residual_px, axis=1) for a in (guessed, found)]
-    return bool(np.median(missed[0]) < BETTER * np.median(missed[1]))
+    if np.median(missed[0]) < BETTER * np.median(missed[1]):
+        return True
+    ahead = np.array([guessed.poses[i].cam_R_map[2, :2] for i in guessed.held])
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    aside = np.linalg.norm(ahead.mean(0)) < ONE_SIDE
+    return bool(aside and off_positions(guessed, priors) < CLEARER * off_positions(found, priors))
 
 
 def agrees(guessed: Alignment, found: Alignment) -> bool:

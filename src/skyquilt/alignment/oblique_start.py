@@ -15,7 +15,6 @@ from skyquilt.alignment.control import fit_similarity_3d
 from skyquilt.alignment.determined import STATED_DEG
 from skyquilt.alignment.oblique import (
     MOST_OBLIQUE,
-    OBLIQUE_DEG,
     tells_angles,
     tilt_deg,
     tilted,
@@ -184,8 +183,8 @@ def as_found(found: Alignment, priors: Sequence[Prior]) -> list[Prior]:
 
 
 def turned_aside(found: Alignment, priors: Sequence[Prior]) -> Array:
-    """(3, 3) rotation of an adjustment as a whole by which photos come nearest to the positions that
-    they report; none where these lie about in a line.
+    """(3, 3) rotation of an adjustment as a whole by which photos come nearest to the positions
+    that they report; none where these lie about in a line.
     """
     held = [i for i in found.held if np.isfinite(priors[i].map_C).all()]
     if len(held) < FEWEST_CROWDED:

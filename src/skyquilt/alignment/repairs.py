@@ -16,7 +16,7 @@ from skyquilt.alignment.false_tilts import told_no_tilt
 from skyquilt.alignment.late_positions import as_moved, mirrored, moved_note, on_time, unshifted
 from skyquilt.alignment.motion import Speeds
 from skyquilt.alignment.oblique import reported_oblique, turned_deg, without_photos
-from skyquilt.alignment.oblique_guess import agrees, better_seen, far_off, lowered, misled
+from skyquilt.alignment.oblique_guess import agrees, believable, far_off, lowered, misled
 from skyquilt.alignment.oblique_start import (
     Beginnings,
     aslant,
@@ -231,8 +231,8 @@ def _guessed_directions(last: Tried, survey: Survey) -> Tried:
     if guess is None:
         return last
     other = survey.tried(last.begun, guess=guess, aside=untold(guess), name="guessed ")
-    fits = better_seen(other.found, last.found, priors) and agrees(other.found, last.found)
-    if fits and nearer(other.found, last.found, priors):
+    credible = believable(other.found, last.found, priors) and agrees(other.found, last.found)
+    if credible and nearer(other.found, last.found, priors):
         return replace(other, notes=last.notes)
     return last
 
