@@ -612,3 +612,27 @@ def test_a_stretched_picture_that_its_calibration_tells_is_not_named():
     found = flown.aligned()
     assert found.cameras["cam"].aspect == pytest.approx(0.75, abs=0.002)
     assert not any("anamorphic" in n for n in found.notes)
+
+
+@pytest.mark.parametrize("axis", [slice(0, 2), pytest.param(2, marks=pytest.mark.slow)])
+def test_positions_that_are_wrong_by_themselves_do_not_draw_the_block(axis):
+    """Two photos that tell each other's place, or heights 40 m too large: what is found is what is
+    found without their positions.
+    """
+    flown = Flown(2, gps=1.0, lines=4, per_line=4, points=250)
+    told = list(flown.priors)
+    centre = [p.map_C.copy() for p in told]
+    if axis == 2:
+        centre[3][2] += 40
+        centre[10][2] += 40
+    else:
+        centre[3], centre[10] = centre[10], centre[3]
+    flown.priors = [replace(p, map_C=C) for p, C in zip(told, centre, strict=True)]
+    found = flown.aligned()
+    for i in (3, 10):
+        told[i] = replace(told[i], map_C=np.full(3, np.nan))
+    flown.priors = told
+    without = flown.aligned()
+    apart = [found.poses[i].map_C - without.poses[i].map_C for i in without.held]
+    assert len(found.held) == 16
+    assert np.abs(apart).max() < 0.25

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from skyquilt.alignment.adjust import covariance
-from skyquilt.alignment.deviations import HIDDEN, MATCHED, likeness, observed_noise
+from skyquilt.alignment.deviations import HIDDEN, MATCHED, likeness, lone_errors, observed_noise
 from skyquilt.alignment.stages import weighed
 from tests.alignment.blocks import HEIGHT, WIDTH, make_block
 
@@ -105,3 +105,24 @@ def test_without_observations_nothing_is_weighed():
     setup = SimpleNamespace(size=np.tile([WIDTH, HEIGHT], (photos, 1)), members=np.arange(photos))
     problem, state = weighed(empty, block.truth, setup)
     assert problem is empty and state is block.truth
+
+
+def test_single_gross_errors_of_positions_are_told_from_bends_and_displaced_parts():
+    rng = np.random.default_rng(0)
+    error = rng.normal(0, 2, (40, 2))
+    error[3] += 60
+    error[17] -= (50, 0)
+    error[30] = np.nan
+    assert np.flatnonzero(lone_errors(error, 1.5)).tolist() == [3, 17]
+    ends = error.copy()
+    ends[3], ends[17], ends[0], ends[-1] = 0, 0, 60, 60
+    assert np.flatnonzero(lone_errors(ends, 1.5)).tolist() == [0, 39]
+    bent = np.linspace(-3, 3, 40)[:, None] ** 4 + rng.normal(0, 1, (40, 1))
+    assert not lone_errors(bent, 1.5).any()
+    part = rng.normal(0, 2, (40, 2))
+    part[10:13] += 60  # a receiver that was stuck
+    assert not lone_errors(part, 1.5).any()
+    many = rng.normal(0, 2, (40, 2))
+    many[1::4] += 60
+    assert not lone_errors(many, 1.5).any()
+    assert not lone_errors(error[:5], 1.5).any()

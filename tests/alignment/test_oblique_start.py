@@ -392,6 +392,32 @@ def test_pitch_counted_from_straight_down_is_found_by_the_pictures(seed):
         assert np.degrees(np.arccos((np.trace(R @ where.cam_R_map.T) - 1) / 2)) < 5
 
 
+@pytest.mark.parametrize(
+    "told",
+    [
+        "alike",
+        *(pytest.param(k, marks=pytest.mark.slow) for k in ("some", "compass", "gimbal yaw")),
+    ],
+)
+def test_photos_that_look_down_whatever_they_report_are_found_by_the_pictures(told):
+    """One angle in all files; pitch counted from straight down in some; a compass that is off as
+    well, or headings that tell nothing.
+    """
+    flown, rng = Slanting(grid(2), seed=4), np.random.default_rng(4)
+    wrong = {
+        "alike": lambda i, p: replace(p, pitch_deg=45.0, roll_deg=0.0),
+        "some": lambda i, p: replace(p, pitch_deg=p.pitch_deg + 90 * (i % 2)),
+        "compass": lambda i, p: replace(p, pitch_deg=p.pitch_deg + 90, yaw_deg=p.yaw_deg + 90),
+        "gimbal yaw": lambda i, p: replace(p, pitch_deg=90.0, yaw_deg=rng.uniform(-180, 180)),
+    }[told]
+    flown.priors = [wrong(i, p) for i, p in enumerate(flown.priors)]
+    found = flown.aligned()
+    assert len(found.held) == len(flown.photos)
+    assert np.median(flown.errors(found)[0]) < 2.0
+    said = LOWERED if told in ("compass", "gimbal yaw") else "they look down: their tilts were not"
+    assert any(said in note for note in found.notes)
+
+
 def test_what_looks_at_the_horizon_is_not_lowered():
     flown = Slanting(orbit(24, 40, pitch=72), seed=1)
     found = replace(flown.aligned(), poses=dict(enumerate(flown.truth)))

@@ -23,6 +23,10 @@ from skyquilt.alignment.problem import CAMERA, PART, Problem, State, residuals_p
 Array = NDArray[np.float64]
 CELLS = 8
 """Cells of a photo along each side in which residuals of neighbours are compared."""
+FEWEST_ERRORS, LONE, MOST_LONE = 6, 5.0, 0.2
+"""Of so many known positions and more, those are wrong by themselves whose errors are so many times
+as large as most; where they are more than this share, nothing tells which ones are wrong.
+"""
 REACH = 2
 """Parts of a photo along each side over which a correlation is taken to reach."""
 
@@ -160,6 +164,26 @@ def believed(problem: Problem, noise: Noise) -> Problem:
     """The problem whose observations weigh what the noise says that they tell."""
     effect = noise.design_effect
     return replace(problem, design_effect=effect, trust=problem.shared / (effect * noise.variance))
+
+
+def lone_errors(error: Array, stated: float) -> NDArray[np.bool_]:
+    """Which errors (n, k) of positions, in order of capture, NaN where unknown, are gross ones of
+    single photos: far larger than most, and than those before and after. Errors that grow from
+    photo to photo are none: they may tell of a bent strip. `stated`: the usual deviation.
+    """
+    lone = np.zeros(len(error), np.bool_)
+    known = np.flatnonzero(np.isfinite(error).all(1))
+    if len(known) < FEWEST_ERRORS:
+        return lone
+    own = error[known]
+    size = np.linalg.norm(own, axis=1)
+    limit = LONE * max(float(np.median(size)), stated)
+    beside = [np.r_[own[1:2], own[:-1]], np.r_[own[1:], own[-2:-1]]]
+    apart = [np.linalg.norm(own - other, axis=1) for other in beside]
+    far = (size > limit) & (np.minimum(*apart) > limit)
+    if far.sum() <= MOST_LONE * len(own):
+        lone[known[far]] = True
+    return lone
 
 
 def position_noise(error: Array) -> float:

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.determined import STATED_DEG
-from skyquilt.alignment.oblique import OBLIQUE_DEG, tilt_deg, tilts_reported
+from skyquilt.alignment.oblique import OBLIQUE_DEG, tilt_deg, tilted, tilts_reported, turned_deg
 from skyquilt.alignment.oblique_start import as_found, off_positions, slanting, turned_far
+from skyquilt.alignment.priors import empty_prior
 from skyquilt.geometry.frames import angles_from_cam_R_map, cam_R_map_from_angles
 from skyquilt.matching.lens_kind import as_pinhole
 from skyquilt.model.features import Features, Link
@@ -32,6 +33,8 @@ AGREES = 0.7
 """An adjustment by a guess that keeps less than this share of the observations of the one before
 contradicts the pictures, however near to their positions its photos come.
 """
+AS_NEAR = 1.05
+"""Photos that lie no further from their positions than this times as far lie as near to them."""
 MATCHES, LOOKED_AT = 40, 20_000
 """Matches of a link, and of all, that are looked at, about."""
 FAR = 4.0
@@ -203,6 +206,52 @@ LOWERED = (
     " their pitch was counted from straight down."
 )
 """What is said of priors that were lowered."""
+
+
+LOOK_DOWN = (
+    "{0} of {1} photos report that they look far aslant, and the pictures show that they look down:"
+    " their tilts were not used."
+)
+"""What is said of priors that were taken to look down."""
+
+
+def taken_to_look_down(priors: Sequence[Prior]) -> list[Prior]:
+    """The priors with those that report oblique views taken to look down, about; headings are those
+    of photos that look down where views were counted from straight down.
+    """
+    loose = empty_prior().sigma_tilt_deg
+
+    def level(prior: Prior) -> Prior:
+        own = _lowered(prior) if _tilt_deg(prior) > LEVEL_DEG else prior
+        return replace(own, pitch_deg=0.0, roll_deg=0.0, sigma_tilt_deg=loose)
+
+    return [level(p) if tilted(p) else p for p in priors]
+
+
+def doubtful_views(found: Alignment, priors: Sequence[Prior], linked: int) -> bool:
+    """Whether an adjustment of `linked` photos of an oblique survey, begun as they report, lost
+    photos, lies far from positions, or turned more photos than a few away from what they report.
+    """
+    lost = len(found.held) < (1 - LOST) * linked
+    turned = sum(turned_deg(found.poses[i], priors[i]) > OBLIQUE_DEG for i in found.held)
+    return lost or far_off(found, priors) or turned > LOST * len(found.held)
+
+
+def shown_to_look_down(
+    level: Alignment, found: Alignment, priors: Sequence[Prior], linked: int
+) -> bool:
+    """Whether an adjustment whose photos began looking down shows that they do: nearly all look
+    down in it, and it keeps as many of them and of their observations as the one with what they
+    report, as near to positions; or far more observations, for photos without any lie where they
+    report.
+    """
+    down = sum(tilt_deg(level.poses[i].cam_R_map) < OBLIQUE_DEG for i in level.held)
+    as_full = len(level.held) >= max(len(found.held), (1 - LOST) * linked)
+    seen, before = len(level.ties.photo), len(found.ties.photo)
+    as_full &= seen >= before
+    as_near = off_positions(level, priors) <= AS_NEAR * off_positions(found, priors)
+    as_near |= AGREES * seen > before and not far_off(level, priors)
+    return as_full and as_near and down >= max(1.0, NEARLY_ALL * len(level.held))
 
 
 def _tilt_deg(prior: Prior) -> float:

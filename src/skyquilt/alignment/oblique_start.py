@@ -146,7 +146,8 @@ def tilt_warnings(
 def _walls(priors: Sequence[Prior], found: Alignment, most_view_deg: float) -> list[str]:
     tilts = np.array([tilt_deg(found.poses[i].cam_R_map) for i in found.held])
     level = int((tilts < VERTICAL_DEG).sum())
-    if not slanting(priors) or level < LEVEL_SHARE * len(tilts) or most_view_deg <= FROM_ABOVE_DEG:
+    few = level < LEVEL_SHARE * len(tilts) or level == len(tilts)
+    if not slanting(priors) or few or most_view_deg <= FROM_ABOVE_DEG:
         return []
     return [
         f"{len(tilts) - level} of {len(tilts)} photos look aslant: around what the other {level}"

@@ -15,8 +15,19 @@ from skyquilt.alignment.enlarged import enlarged_note, enlarged_photos, fits_bet
 from skyquilt.alignment.false_tilts import told_no_tilt
 from skyquilt.alignment.late_positions import as_moved, mirrored, moved_note, on_time, unshifted
 from skyquilt.alignment.motion import Speeds
-from skyquilt.alignment.oblique import reported_oblique, turned_deg, without_photos
-from skyquilt.alignment.oblique_guess import agrees, believable, far_off, lowered, misled
+from skyquilt.alignment.oblique import reported_oblique, tilted, turned_deg, without_photos
+from skyquilt.alignment.oblique_guess import (
+    LOOK_DOWN,
+    LOWERED,
+    agrees,
+    believable,
+    doubtful_views,
+    far_off,
+    lowered,
+    misled,
+    shown_to_look_down,
+    taken_to_look_down,
+)
 from skyquilt.alignment.oblique_start import (
     Beginnings,
     aslant,
@@ -134,6 +145,24 @@ def repaired(first: Tried, survey: Survey) -> Tried:
     for repair in REPAIRS:
         first = repair(first, survey)
     return first
+
+
+def _false_views(last: Tried, survey: Survey) -> Tried:
+    """Photos of an oblique survey that look down, whatever they report, begin so: some programs
+    count a gimbal's pitch from straight down, or write one angle into all files.
+    """
+    priors = last.begun.priors
+    if not slanting(priors) or not doubtful_views(last.found, priors, survey.linked):
+        return last
+    down = taken_to_look_down(priors)
+    other = survey.tried(last.begun, priors=down, aside=frozenset(), name="down ")
+    if not shown_to_look_down(other.found, last.found, priors, survey.linked):
+        return last
+    counted = lowered(other.found, priors)
+    if counted is not priors and not told_no_tilt(other.found, counted)[1]:
+        return replace(survey.tried(other.begun, priors=counted, name="lowered "), notes=(LOWERED,))
+    note = LOOK_DOWN.format(sum(map(tilted, priors)), len(priors))
+    return replace(other, notes=(note,))
 
 
 def _as_reported(last: Tried, survey: Survey) -> Tried:
@@ -310,6 +339,7 @@ def priors_taken(
 
 
 REPAIRS: tuple[Callable[[Tried, Survey], Tried], ...] = (
+    _false_views,
     _mirrored_positions,
     _as_reported,
     _enlargements,

@@ -11,7 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.adjust import adjust
-from skyquilt.alignment.deviations import believed, observed_noise, position_noise, robust_scale
+from skyquilt.alignment.deviations import (
+    believed,
+    lone_errors,
+    observed_noise,
+    position_noise,
+    robust_scale,
+)
 from skyquilt.alignment.equations import NearFactor
 from skyquilt.alignment.problem import (
     READOUT,
@@ -291,7 +297,8 @@ def believe_positions(
     """Positions believed as far as the photos confirm them.
 
     The start gave them deviations as wide as their scatter about it, which is coarse. Here they get
-    those that they state, or their scatter between neighbours where that is clearly larger. Only
+    those that they state, or their scatter between neighbours where that is clearly larger; single
+    ones that are grossly wrong get their error, since together they would shrink the block. Only
     differences from photo to photo count: a smooth misfit may be a deformation of the block, and
     positions with less weight would permit it. Where a block then still misses its positions by
     more than these deviations allow, they are not what they claim (a drifting barometer, a plain
@@ -301,18 +308,27 @@ def believe_positions(
     doubted, near = np.zeros(started.shape, bool), near or NearFactor()
     for again in range(3):
         error = state.C - problem.C0
-        sigma = started.copy()
+        sigma, single = started.copy(), False
         for block in setup.block_rows:
             for axes in (slice(0, 2), slice(2, 3)):
                 stated = setup.stated_sigma_C[block][:, axes]
-                noise = position_noise(error[block][:, axes])
+                own = error[block][:, axes]
+                lone = np.zeros(len(own), bool)
+                if not setup.in_space:  # there a photo may be alone in a false minimum
+                    lone = lone_errors(own, float(np.median(stated)))
+                noise = position_noise(own[~lone])
                 wanted = np.maximum(stated, noise if (noise > CONFIRMED * stated).any() else 0.0)
                 trusted = ~doubted[block][:, axes]
-                sigma[block, axes] = np.where(trusted, wanted, sigma[block, axes])
+                given = np.where(trusted, wanted, sigma[block, axes])
+                single |= bool(lone.any())
+                off = np.linalg.norm(own, axis=1, keepdims=True)
+                sigma[block, axes] = np.where(lone[:, None], off, given)
         alike = np.allclose(sigma, problem.sigma_C, rtol=0.15, equal_nan=True)
         problem = replace(problem, sigma_C=sigma)
         if alike:
             break
+        if single:  # gone is what drew the block aside
+            problem, state = settled(problem, state, setup, clearly=0.0)
         narrow, part = problem.with_loss(2.0), keep.within(str(again))
         state = adjust(narrow, state, iterations=10, tolerance=1e-4, keep=part, near=near).state
         misfit = np.abs(state.C - problem.C0) / problem.sigma_C
@@ -324,9 +340,11 @@ def believe_positions(
     return problem, state
 
 
-def settled(problem: Problem, state: State, setup: Setup) -> tuple[Problem, State]:
+def settled(
+    problem: Problem, state: State, setup: Setup, clearly: float = CLEARLY
+) -> tuple[Problem, State]:
     """The problem and the state with each block moved, turned and enlarged as a whole as its
-    positions and attitudes want it, if they want it clearly.
+    positions and attitudes want it, if they want it clearly: if it saves more than `clearly`.
 
     Observations do not tell these, so steps that follow all unknowns stop long before: of a drone
     that climbs, positions lie within their deviations of one another.
@@ -352,7 +370,7 @@ def settled(problem: Problem, state: State, setup: Setup) -> tuple[Problem, Stat
     there, moved = replace(problem, R0=R0), replace(state, R=R, C=C, X=X)
     gain = prior_terms(problem, state).cost - prior_terms(there, moved).cost
     left = position_terms(there, moved)[2].sum() / max(3 * len(C) - UNTOLD, 1)
-    if gain > CLEARLY * max(min(left, 1.0), LEAST_NOISE):
+    if gain > clearly * max(min(left, 1.0), LEAST_NOISE):
         return there, moved
     return problem, state
 
