@@ -392,6 +392,7 @@ def test_pitch_counted_from_straight_down_is_found_by_the_pictures(seed):
         assert np.degrees(np.arccos((np.trace(R @ where.cam_R_map.T) - 1) / 2)) < 5
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize(
     "told",
     [

@@ -260,8 +260,8 @@ def _guessed_directions(last: Tried, survey: Survey) -> Tried:
     if guess is None:
         return last
     other = survey.tried(last.begun, guess=guess, aside=untold(guess), name="guessed ")
-    credible = believable(other.found, last.found, priors) and agrees(other.found, last.found)
-    if credible and nearer(other.found, last.found, priors):
+    fits = nearer(other.found, last.found, priors) and agrees(other.found, last.found)
+    if fits and believable(other.found, last.found, priors):
         return replace(other, notes=last.notes)
     return last
 

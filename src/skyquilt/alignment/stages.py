@@ -271,8 +271,9 @@ def _places_of(problem: Problem, state: State) -> NDArray[np.int64]:
 
 
 def heights_above(state: State) -> Array:
-    """Heights (n,) in m of the cameras above the points."""
-    return np.maximum(state.C[:, 2] - np.median(state.X[:, 2]), 1.0)
+    """Heights (n,) in m of the cameras above the points; NaN where none is left."""
+    ground = np.median(state.X[:, 2]) if len(state.X) else np.nan
+    return np.maximum(state.C[:, 2] - ground, 1.0)
 
 
 def prune(problem: Problem, state: State, limit: float) -> tuple[Problem, State]:
