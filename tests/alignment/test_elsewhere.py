@@ -79,6 +79,18 @@ def test_the_accuracy_is_that_of_the_ground_that_other_photos_show(block):
     assert without_photos(found, {}) is found
 
 
+def test_the_accuracy_is_not_that_of_points_too_uncertain_for_the_ground(block):
+    """Three points high above others of the ground, known to 20 m, are no tie points any more."""
+    _, found = block
+    told, shown = found.accuracy, np.bincount(found.ties.point)
+    lost = found.ties.xyz[np.argsort(-shown)[:3]] + (0.0, 0.0, 12.0)
+    more = replace(told, xyz=np.concatenate([told.xyz, lost]),
+                   sigma_m=np.concatenate([told.sigma_m, np.full((3, 3), 20.0)]))  # fmt: skip
+    left = without_photos(replace(found, accuracy=more), {0: ""}).accuracy
+    assert len(left.xyz) > len(told.xyz) / 2
+    assert left.sigma_m.max() < 2.0
+
+
 def test_points_that_nothing_determines_tell_nothing_of_the_ground(monkeypatch):
     """Of every tenth point the deviation is that of no information."""
     plain = Flown(3).aligned().accuracy

@@ -25,6 +25,10 @@ from skyquilt.model.poses import Alignment, Pose, Prior, TiePoints
 Array = NDArray[np.float64]
 OBLIQUE_DEG = 35.0
 """Photos tilted by more than this from the vertical are oblique."""
+SAME_POINT = 0.005
+"""Points nearer to a tie point than this share of the flying height are that point; others are none
+any more, too uncertain for the ground.
+"""
 MOST_OBLIQUE = 0.4
 """With a larger share of oblique photos than this the survey itself is oblique, and they are not
 told apart.
@@ -157,8 +161,10 @@ def without_photos(alignment: Alignment, gone: Mapping[int, str]) -> Alignment:
     if told is not None and len(alignment.ties.xyz):  # of the ground that others show
         before = alignment.ties
         others = before.point[~np.isin(before.photo, list(gone))]
-        _, at = nearest(before.xyz[:, :2], told.xyz[:, :2], 1)
+        away, at = nearest(before.xyz, told.xyz, 1)
         stays = (np.bincount(others, minlength=len(before.xyz)) >= 2)[at[:, 0]]
+        above = np.median([p.map_C[2] for p in alignment.poses.values()]) - alignment.ground_m
+        stays &= away[:, 0] < SAME_POINT * max(float(above), 1.0)
         told = replace(told, xyz=told.xyz[stays], sigma_m=told.sigma_m[stays])
     return replace(
         alignment,
