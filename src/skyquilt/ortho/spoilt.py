@@ -146,10 +146,11 @@ def coarser_parts(
             factors.append(factor)
     if not found:
         return {}, ()
+    some = f"{len(found)} photos show" if len(found) > 1 else "One photo shows"
     return found, (
-        f"{len(found)} photos show ground by pixels {np.median(factors):.1f} times as large as"
+        f"{some} ground by pixels {np.median(factors):.1f} times as large as"
         f" others show it ({sentence_of([names[i] for i in found])}): another camera, or a higher"
-        " flight. They are drawn only where no finer photo shows the ground.",
+        " flight. Such pictures are drawn only where no finer photo shows the ground.",
     )
 
 
