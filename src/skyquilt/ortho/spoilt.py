@@ -146,9 +146,9 @@ def coarser_parts(
             factors.append(factor)
     if not found:
         return {}, ()
-    some = f"{len(found)} photos show" if len(found) > 1 else "One photo shows"
+    they_show = f"{len(found)} photos show" if len(found) > 1 else "One photo shows"
     return found, (
-        f"{some} ground by pixels {np.median(factors):.1f} times as large as"
+        f"{they_show} ground by pixels {np.median(factors):.1f} times as large as"
         f" others show it ({sentence_of([names[i] for i in found])}): another camera, or a higher"
         " flight. Such pictures are drawn only where no finer photo shows the ground.",
     )
