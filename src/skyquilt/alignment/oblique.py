@@ -25,10 +25,6 @@ from skyquilt.model.poses import Alignment, Pose, Prior, TiePoints
 Array = NDArray[np.float64]
 OBLIQUE_DEG = 35.0
 """Photos tilted by more than this from the vertical are oblique."""
-SAME_POINT = 0.005
-"""Points nearer to a tie point than this share of the flying height are that point; others are none
-any more, too uncertain for the ground.
-"""
 MOST_OBLIQUE = 0.4
 """With a larger share of oblique photos than this the survey itself is oblique, and they are not
 told apart.
@@ -38,6 +34,10 @@ FAR_OFF, TURNED_DEG = 8.0, 10.0
 LEAST_FALL = np.cos(np.radians(60.0))
 """Flatter views count as if they fell as steeply as this: what they show best lies nearer than the
 place in their middle.
+"""
+SAME_POINT = 0.005
+"""Points nearer to a tie point than this share of the flying height are that point; others are none
+any more, too uncertain for the ground.
 """
 SAME_PX = 3.0
 """Distance in px of the image searched for features up to which a keypoint is that of a tie

@@ -148,8 +148,10 @@ def guessed_priors(
     rays = _rays(photos, priors, features, links)
     if rays is None:
         return None
-    best, least = None, CLEARER * _miss(rays, _rotations(priors))
-    if found is not None and not tilts_reported(priors):
+    best: list[Prior] | None = None
+    if found is None or tilts_reported(priors):
+        least = CLEARER * _miss(rays, _rotations(priors))
+    else:
         best, least = _tilted_alike(rays, priors, found)
         if not (far_off(found, priors) or turned_far(found, priors)):
             return best
@@ -171,10 +173,10 @@ def _tilted_alike(
     for i in found.held:
         own[i] = found.poses[i].cam_R_map
         yaws[i] = angles_from_cam_R_map(own[i])[0]
-        level[i] = cam_R_map_from_angles(yaws[i])
+        level[i] = cam_R_map_from_angles(0.0).T @ cam_R_map_from_angles(yaws[i])
 
     def missed(tilt: tuple[float, float]) -> float:
-        return _miss(rays, cam_R_map_from_angles(0.0, *tilt) @ cam_R_map_from_angles(0.0).T @ level)
+        return _miss(rays, cam_R_map_from_angles(0.0, *tilt) @ level)
 
     turns = np.radians(np.arange(0, 360, ROUND_DEG))
     tilts = [(t * np.cos(a), t * np.sin(a)) for t in ALIKE_DEG for a in turns.tolist()]
