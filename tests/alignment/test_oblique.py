@@ -227,22 +227,24 @@ def test_the_dominant_plane_levels_the_map_whatever_stands_on_it():
 
 
 @pytest.mark.parametrize(
-    ("pitch", "lines", "slope", "vertical"),
+    ("pitch", "lines", "slope", "climb", "vertical"),
     [
-        (0.0, (0, 180, 0), 20.0, True),
-        (0.0, (0, 180, 0), 0.0, True),
-        (25.0, (0, 180, 0), 0.0, False),  # cameras tilted on their drones look two ways
-        (25.0, (0, 0, 0), 0.0, False),  # and so might these on a slope: the ground counts
+        (0.0, (0, 180, 0), 20.0, 20.0, True),
+        (0.0, (0, 180, 0), 0.0, 0.0, True),
+        (25.0, (0, 180, 0), 0.0, 0.0, False),  # cameras tilted on their drones look two ways
+        (25.0, (0, 0, 0), 0.0, 0.0, False),  # and so might these on a slope: the ground counts
+        (0.0, (0, 0, 0), 20.0, 0.0, True),  # flown at one height over a slope
+        (0.0, (0, 0, 0), 20.0, 20.0, False),  # along it: cameras might be tilted
     ],
 )
-def test_ground_is_a_slope_where_photos_of_several_headings_look_the_same_way(
-    pitch, lines, slope, vertical
+def test_ground_is_a_slope_where_photos_of_several_headings_or_one_height_look_the_same_way(
+    pitch, lines, slope, climb, vertical
 ):
     rng = np.random.default_rng(4)
     xyz = hills(2000) * (1, 1, 0.3)
     xyz[:, 2] += np.tan(np.radians(slope)) * xyz[:, 0]
     flown = [
-        pose(x, y, z=60 + np.tan(np.radians(slope)) * x, yaw=yaw, pitch=pitch + rng.normal(0, 1))
+        pose(x, y, z=60 + np.tan(np.radians(climb)) * x, yaw=yaw, pitch=pitch + rng.normal(0, 1))
         for y, yaw in zip((-30, 0, 30), lines, strict=True)
         for x in (-40, -20, 0, 20, 40)
     ]
@@ -259,7 +261,7 @@ def test_ground_is_a_slope_where_photos_of_several_headings_look_the_same_way(
     tilts = [tilt_deg(p.cam_R_map) for p in again.poses.values()]
     assert (np.median(tilts) < 2) == vertical
     ground = np.degrees(np.arccos(dominant_normal(again.ties.xyz, 1.8)[2]))
-    assert ground == pytest.approx(slope, abs=1.0)
+    assert ground == pytest.approx(slope if vertical else 0.0, abs=1.0)
 
 
 def test_a_photo_without_links_is_not_drawn_over_what_others_show():

@@ -308,6 +308,8 @@ def test_photos_that_an_adjustment_turned_are_taken_to_report_that():
     assert "none reports its camera angles" in says
     nowhere = [replace(p, map_C=np.full(3, np.nan)) for p in level]
     assert turned_priors(found, nowhere) is None
+    (says,) = tilt_warnings(nowhere, found)
+    assert "was taken to be level" in says and "rest on positions" not in says
 
 
 def test_walls_around_what_photos_show_from_above_are_told():

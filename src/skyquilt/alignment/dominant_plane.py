@@ -23,6 +23,14 @@ SLOPING_DEG = 5.0
 """Ground that is less inclined is level: axes of vertical photos are not known better."""
 SCATTERS = 3.0
 """Deviations of the axes by which the ground must be inclined as well."""
+FLAT = 0.05
+"""Camera centres are a plane if they scatter about it by no more than this share of how wide they
+lie along it where they lie least wide: as flown at one height.
+"""
+FEWEST_LEVEL = 6
+"""Fewer centres are no plane."""
+UPRIGHT_DEG = 3.0
+"""Photos look straight down from a plane of camera centres that their axes are so normal to."""
 
 
 def dominant_normal(xyz: Array, near_m: float) -> Array:
@@ -52,15 +60,16 @@ def levelled(alignment: Alignment) -> Alignment:
 
     Ground may slope, though: most photos of a flight with a gimbal look straight down. They do if
     their axes are parallel while they are headed in several directions, since cameras tilted on
-    their drones would look another way on each line. Then their axes are the vertical where the
-    plane lies clearly inclined to them.
+    their drones would look another way on each line, or if their axes are normal to a plane that
+    they were taken in. Then their axes are the vertical where the plane lies clearly inclined to
+    them.
     """
     xyz = alignment.ties.xyz
     if len(xyz) < 3:
         return alignment
     C = np.array([p.map_C for p in alignment.poses.values()])
     normal = dominant_normal(xyz, NEAR * _height(C, xyz))
-    seen = vertical_of(np.array([p.cam_R_map for p in alignment.poses.values()]))
+    seen = vertical_of(np.array([p.cam_R_map for p in alignment.poses.values()]), C)
     if seen is not None:
         inclined = np.degrees(np.arccos(np.clip(seen[0] @ normal, -1, 1)))
         if inclined > max(SLOPING_DEG, SCATTERS * seen[1]):
@@ -73,12 +82,14 @@ def levelled(alignment: Alignment) -> Alignment:
     return alignment.carried(Q, 1.0, np.median(xyz, axis=0))
 
 
-def vertical_of(cam_R_map: Array) -> tuple[Array, float] | None:
-    """The upward vertical (3,) of photos that look straight down, from their rotations (n, 3, 3),
-    and the scatter of their axes about it in degrees; None where most do not look the same way, or
-    all of these are headed alike: such photos may slant.
+def vertical_of(cam_R_map: Array, map_C: Array) -> tuple[Array, float] | None:
+    """The upward vertical (3,) of photos that look straight down, from their rotations (n, 3, 3)
+    and centres (n, 3), and the scatter of their axes about it in degrees; None where most do not
+    look the same way, or all of these are headed alike and their axes are not normal to a plane
+    that they were taken in: such photos may slant.
     """
-    cam_R_map = cam_R_map[:: max(1, len(cam_R_map) // SAMPLED)]
+    each = max(1, len(cam_R_map) // SAMPLED)
+    cam_R_map, map_C = cam_R_map[::each], map_C[::each]
     axes = cam_R_map[:, 2]
     near = axes @ axes.T > np.cos(np.radians(ALIKE_DEG))
     some = near[int(np.argmax(near.sum(1)))]
@@ -90,10 +101,19 @@ def vertical_of(cam_R_map: Array) -> tuple[Array, float] | None:
     ahead -= (ahead @ down)[:, None] * down
     ahead /= np.linalg.norm(ahead, axis=1)[:, None]
     turned = ahead @ ahead.T < np.cos(np.radians(TURNED_DEG))
-    if turned.mean(1).min() < TURNED_SHARE:
+    if turned.mean(1).min() < TURNED_SHARE and not _flown_level(map_C[some], down):
         return None
     off = np.arccos(np.clip(axes[some] @ down, -1, 1))
     return -down, float(np.degrees(np.sqrt((off**2).mean())))
+
+
+def _flown_level(C: Array, axis: Array) -> bool:
+    """Whether centres (n, 3) lie in a plane that the common axis (3,) of their photos is normal to."""
+    if len(C) < FEWEST_LEVEL:
+        return False
+    _, wide, directions = np.linalg.svd(C - C.mean(0), full_matrices=False)
+    upright = abs(float(directions[2] @ axis)) > np.cos(np.radians(UPRIGHT_DEG))
+    return bool(upright and wide[2] < FLAT * wide[1])
 
 
 def _frame(up: Array, side: Array) -> Array:
