@@ -108,7 +108,7 @@ def vertical_of(cam_R_map: Array, map_C: Array) -> tuple[Array, float] | None:
 
 
 def _flown_level(C: Array, axis: Array) -> bool:
-    """Whether centres (n, 3) lie in a plane that the common axis (3,) of their photos is normal to."""
+    """Whether centres (n, 3) lie in a plane that the axis (3,) of their photos is normal to."""
     if len(C) < FEWEST_LEVEL:
         return False
     _, wide, directions = np.linalg.svd(C - C.mean(0), full_matrices=False)

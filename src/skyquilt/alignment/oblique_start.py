@@ -138,9 +138,9 @@ def tilt_warnings(
         return _walls(priors, found, most_view_deg)
     if np.isnan(off_positions(found, priors)):
         return [
-            "Most photos look far from straight down at the plane that most of the ground lies in, and"
-            " none reports a position or camera angles: that plane was taken to be level. Give"
-            " positions, camera angles or control points if the ground slopes."
+            "Most photos look far from straight down at the plane that most of the ground lies"
+            " in, and none reports a position or camera angles: that plane was taken to be level."
+            " Give positions, camera angles or control points if the ground slopes."
         ]
     return [
         "Most photos look far from straight down, and none reports its camera angles: heights,"
