@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 
 from skyquilt.alignment import repairs
-from skyquilt.alignment.false_tilts import told_no_tilt
+from skyquilt.alignment.false_tilts import common_tilts, told_no_tilt
+from skyquilt.geometry.frames import cam_R_map_from_angles, rotation_from_vector
+from skyquilt.model.poses import Pose
+from tests.alignment.surveys import prior
 from tests.alignment.test_bundle import Flown
+from tests.alignment.test_oblique import block, hills
 
 
 def off(found, flown):
@@ -52,3 +56,82 @@ def test_tilts_that_are_right_stay(wrong):
     found = flown.aligned()
     assert told_no_tilt(found, flown.priors) == (flown.priors, "")
     assert not any("tilts of the camera" in n for n in found.notes)
+
+
+def lines(headings, *, ahead_deg, gps=1.0, drift=0.0, map_deg=0.0, seed=0, count=8):
+    """Three lines of photos as found in a map that is tilted, and what files report: pitch with an
+    error of `ahead_deg` degrees, heights that drift by so many m over the flight.
+    """
+    rng = np.random.default_rng(seed)
+    lean = rotation_from_vector(np.radians(map_deg) * np.array([0.8, 0.6, 0.0]))
+    found, told = [], []
+    total = count * len(headings)
+    for line, heading in enumerate(headings):
+        for k in range(count)[:: 1 - 2 * (line % 2)]:
+            pitch, roll = rng.normal(0, 2, 2)
+            where = np.array([25.0 * line, 12.0 * k, 60.0])
+            R = cam_R_map_from_angles(heading, pitch, roll)
+            found.append(Pose(cam_R_map=R @ lean.T, map_C=lean @ where))
+            late = np.array([0, 0, drift * len(told) / total])
+            off = rng.normal(0, gps, 3) * (1, 1, 1.5)
+            error = rng.normal(0, 0.5, 2)
+            told.append(
+                prior(
+                    where + late + off,
+                    yaw=heading + rng.normal(0, 3),
+                    pitch=pitch + ahead_deg + error[0],
+                    roll=roll + error[1],
+                )
+            )
+    return block(found, hills(60)), told
+
+
+@pytest.mark.parametrize("drift", [0.0, 15.0])
+@pytest.mark.parametrize(
+    ("headings", "ahead_deg", "within_deg"),
+    [
+        ((20, 200, 20), 5.0, 0.4),
+        ((20, 200, 20), -2.0, 0.4),
+        ((20, 110, 200), 12.0, 0.4),
+        ((0, 0, 0), 5.0, 1.5),  # by heights
+        ((0, 0, 0), -8.0, 1.5),
+    ],
+)
+def test_an_error_that_photos_of_a_camera_have_in_common_is_corrected(
+    headings, ahead_deg, within_deg, drift
+):
+    for seed in range(5):
+        found, told = lines(headings, ahead_deg=ahead_deg, drift=drift, map_deg=3.0, seed=seed)
+        right = lines(headings, ahead_deg=0.0, drift=drift, map_deg=3.0, seed=seed)[1]
+        corrected, notes = common_tilts(found, told, ["c"] * len(told))
+        (note,) = notes
+        assert "photos of c look" in note
+        off = [a.pitch_deg - b.pitch_deg for a, b in zip(corrected, right, strict=True)]
+        aside = [a.roll_deg - b.roll_deg for a, b in zip(corrected, right, strict=True)]
+        assert abs(np.median(off)) < within_deg and abs(np.median(aside)) < within_deg
+        turned = [a.yaw_deg - b.yaw_deg for a, b in zip(corrected, right, strict=True)]
+        assert np.abs((np.array(turned) + 180) % 360 - 180).max() < 3.0
+
+
+@pytest.mark.parametrize(
+    ("headings", "ahead_deg", "map_deg", "drift"),
+    [
+        ((20, 200, 20), 0.0, 3.0, 15.0),  # the map is tilted, not the gimbal
+        ((20, 200, 20), 0.5, 0.0, 0.0),  # usual
+        ((0, 0, 0), 0.0, 3.0, 25.0),
+        ((0, 0, 0), 2.0, 0.0, 0.0),  # receivers wander by as much
+        ((20,), 6.0, 0.0, 0.0),  # a drifting barometer looks the same
+    ],
+)
+def test_other_errors_are_not_taken_for_those_of_a_gimbal(headings, ahead_deg, map_deg, drift):
+    for seed in range(5):
+        found, told = lines(headings, ahead_deg=ahead_deg, map_deg=map_deg, drift=drift, seed=seed)
+        assert common_tilts(found, told, ["c"] * len(told)) == (told, ())
+
+
+def test_a_gimbal_that_tells_too_much_does_not_tilt_the_map():
+    """Its lines there outnumber those back, and won before."""
+    flown = Flown(4, lines=3, per_line=6, points=900)
+    flown.priors = [replace(p, pitch_deg=p.pitch_deg + 6.0) for p in flown.priors]
+    found = flown.aligned()
+    assert np.median(off(found, flown)) < 0.3

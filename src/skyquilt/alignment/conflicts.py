@@ -117,7 +117,8 @@ def _altitudes(
                     reported=round(reported, 1),
                     estimated=round(reported - float(e), 1),
                     meaning=f"by image scale and neighbours it is {abs(e):.0f} m {where}:"
-                    " a drifting barometer or receiver, or a digital zoom",
+                    " a drifting barometer or receiver, camera angles that are all off alike, or a"
+                    " digital zoom",
                 )
             )
     return out

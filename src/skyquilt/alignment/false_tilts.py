@@ -1,15 +1,24 @@
-"""Tilts that files report and pictures contradict: those of a camera fixed to its aircraft, whose
-files say that it looked straight down. Believed to a degree, they bend the map.
+"""Tilts that files report and pictures contradict. Believed to a degree, they bend or tilt the map.
+
+Those of a camera fixed to its aircraft, whose files say that it looked straight down, are not used.
+Those of a gimbal with an error that all its photos have in common are corrected: photos headed in
+several directions tell it from a tilt of the map.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skyquilt.alignment.determined import STATED_DEG
 from skyquilt.alignment.priors import empty_prior
-from skyquilt.geometry.frames import angles_from_cam_R_map, cam_R_map_from_angles
+from skyquilt.geometry.frames import (
+    angles_from_cam_R_map,
+    cam_R_map_from_angles,
+    rotation_from_vector,
+)
 from skyquilt.model.poses import Alignment, Prior
 
 FEWEST = 6
@@ -26,6 +35,190 @@ NOTE = (
     " {0:.0f} degrees away from where they say (a camera that is fixed to its aircraft?). They were"
     " not used."
 )
+COMMON_DEG = 1.0
+"""Smaller errors that photos of a camera have in common are usual."""
+COMMON_DEVIATIONS = 4.0
+"""Such an error is larger than this many of its deviations,"""
+COMMON_LEFT = 0.5
+"""and leaves less than this share of it."""
+LEAST_SCATTER_DEG = 0.3
+"""Tilts that photos report are not better than this, even where they agree by chance."""
+LEAST_INSIDE = 0.5
+"""Cosine of the angle between axes told and found, above which they are compared."""
+LEAST_NOISE = 0.3
+"""Heights that photos report are not better than this share of their deviations."""
+ROUNDS = 12
+"""Of reweighting,"""
+CUT = 3.0
+"""by which an observation counts a half if it is off by this times the scatter."""
+MEDIAN_LENGTH = {1: 0.674, 2: 1.177}
+"""Of one and of two normal variables of deviation 1."""
+WIDEST = 1e3
+"""Deviation of unknowns before anything is observed: tangents, or m."""
+COMMON_NOTE = (
+    "All photos of {0} look {1:.1f} degrees aside of where they say, the same way as seen from the"
+    " camera (a gimbal that is not calibrated?): their angles were corrected by that."
+)
+
+Array = NDArray[np.float64]
+
+
+def _told_axis(found: Alignment, prior: Prior, i: int) -> Array:
+    """(3,) where a photo tells that it looks, in the frame of the camera found; the heading is the
+    one found, since that of files may be wrong by itself.
+    """
+    R = found.poses[i].cam_R_map
+    yaw = angles_from_cam_R_map(R)[0]
+    return np.asarray(R @ cam_R_map_from_angles(yaw, prior.pitch_deg, prior.roll_deg)[2])
+
+
+def common_tilts(
+    found: Alignment, priors: Sequence[Prior], cameras: Sequence[str]
+) -> tuple[Sequence[Prior], tuple[str, ...]]:
+    """The priors with tilts corrected by what photos of a camera have in common beside where they
+    were found, and a note for each such camera; the very same priors where there is none.
+    `cameras`: names by photo, in order of capture.
+
+    An error of the gimbal turns with the camera, a tilt of the map does not: both are solved for
+    together. Of photos that are all headed alike, heights tell a tilt of the map, as far as it is
+    not one that may be a drift over the flight.
+    """
+    own = [i for i in found.held if priors[i].sigma_tilt_deg <= STATED_DEG]
+    told = {i: _told_axis(found, priors[i], i) for i in own}
+    own = [i for i in own if told[i][2] > LEAST_INSIDE]
+    names = [n for n in dict.fromkeys(cameras) if sum(cameras[i] == n for i in own) >= FEWEST]
+    own = [i for i in own if cameras[i] in names]
+    if not own:
+        return priors, ()
+    camera = np.array([names.index(cameras[i]) for i in own])
+    block_of = {i: number for number, members in enumerate(found.blocks) for i in members}
+    block = np.array([block_of[i] for i in own])
+    tangents = np.array([told[i][:2] / told[i][2] for i in own])
+    sigma = np.array([priors[i].sigma_C[2] for i in own])
+    turns = _turns(np.array([found.poses[i].cam_R_map for i in own]), camera, block)
+    fit = _fitted([(turns, tangents, np.radians(LEAST_SCATTER_DEG))])
+    least_deg = COMMON_DEG
+    if any(np.trace(_known(fit, number, least_deg)) < 1.5 for number in range(len(names))):
+        least_deg = FALSE_DEG
+        C = np.array([found.poses[i].map_C for i in own])
+        high = np.array([priors[i].map_C[2] for i in own]) - C[:, 2]
+        known = np.isfinite(high)
+        heights = _heights(C, np.array(own), camera, block)[known]
+        least = LEAST_NOISE * float(np.median(sigma[known])) if known.any() else 1.0
+        wide = np.zeros((*turns.shape[:2], heights.shape[2]))
+        wide[..., : turns.shape[2]] = turns
+        fit = _fitted(
+            [
+                (wide, tangents, np.radians(LEAST_SCATTER_DEG)),
+                (heights, high[known][:, None], least),
+            ]
+        )
+    said, corrected = [], list(priors)
+    for number, name in enumerate(names):
+        x = _known(fit, number, least_deg) @ fit.x[2 * number : 2 * number + 2]
+        off = float(np.degrees(np.arctan(np.linalg.norm(x))))
+        left = np.degrees(np.median(fit.left[camera == number]))
+        if off <= least_deg or left > COMMON_LEFT * off:
+            continue
+        axis = np.array([-x[1], x[0], 0.0])
+        back = rotation_from_vector(axis / np.linalg.norm(axis) * np.radians(off))
+        for i, prior in enumerate(priors):
+            if cameras[i] == name and prior.sigma_tilt_deg <= STATED_DEG:
+                corrected[i] = _turned(prior, back)
+        said.append(COMMON_NOTE.format(name, off))
+    return (corrected if said else priors), tuple(said)
+
+
+def _known(fit: "_Fit", camera: int, least_deg: float) -> Array:
+    """(2, 2) projection of a camera's error onto the axes along which errors of `least_deg` would
+    be told from chance.
+    """
+    own = slice(2 * camera, 2 * camera + 2)
+    variance, axes = np.linalg.eigh(fit.covariance[own, own])
+    told = COMMON_DEVIATIONS * np.degrees(np.sqrt(variance)) < least_deg
+    return np.asarray(axes * told @ axes.T)
+
+
+def _turns(cam_R_map: Array, camera: NDArray[np.int64], block: NDArray[np.int64]) -> Array:
+    """(n, 2, k) by how much axes told move in pictures per tangent of an error of their camera (x
+    and y of each camera), and per rad of a turn of the map about its x and y (of each block).
+    """
+    each, first = np.arange(len(camera)), 2 * (camera.max() + 1)
+    rows = np.zeros((len(camera), 2, first + 2 * (block.max() + 1)))
+    for axis in range(2):
+        rows[each, axis, 2 * camera + axis] = 1.0
+        rows[each, 0, first + 2 * block + axis] = -cam_R_map[:, 1, axis]
+        rows[each, 1, first + 2 * block + axis] = cam_R_map[:, 0, axis]
+    return rows
+
+
+def _heights(
+    C: Array, order: NDArray[np.int64], camera: NDArray[np.int64], block: NDArray[np.int64]
+) -> Array:
+    """(n, 1, l) by how many m heights told are above those found per unit of the unknowns of
+    `_turns`, and then per m of an offset of each block, and of a drift of each camera in it.
+    """
+    cameras, blocks = camera.max() + 1, block.max() + 1
+    first = 2 * (cameras + blocks)
+    rows, each = np.zeros((len(C), 1, first + blocks * (1 + cameras))), np.arange(len(C))
+    place = C - C.mean(0)
+    rows[each, 0, 2 * (cameras + block)] = -place[:, 1]
+    rows[each, 0, 2 * (cameras + block) + 1] = place[:, 0]
+    rows[each, 0, first + block] = 1.0
+    late = np.interp(order, [order.min(), max(order.max(), order.min() + 1)], [-1.0, 1.0])
+    rows[each, 0, first + blocks + block * cameras + camera] = late
+    return rows
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Fit:
+    """Unknowns found by iteratively reweighted least squares."""
+
+    x: Array
+    """(k,) the unknowns."""
+    covariance: Array
+    """(k, k) of them."""
+    left: Array
+    """(n,) lengths of what is left of the first group's observations."""
+
+
+def _fitted(groups: Sequence[tuple[Array, Array, float]]) -> _Fit:
+    """The unknowns by groups of observations alike: rows (n, d, k), observed (n, d), and the least
+    that these scatter by.
+    """
+    k, total = groups[0][0].shape[2], sum(observed.size for _, observed, _ in groups)
+    x: NDArray[Any] = np.zeros(k)
+    left: list[Array] = []
+    for again in range(ROUNDS):
+        N, y = np.eye(k) * WIDEST**-2, np.zeros(k)
+        left = [np.linalg.norm(observed - rows @ x, axis=1) for rows, observed, _ in groups]
+        for (rows, observed, least), away in zip(groups, left, strict=True):
+            scatter = max(float(np.median(away)) / MEDIAN_LENGTH[observed.shape[1]], least)
+            far = (away / (CUT * scatter)) ** 2 if again else np.zeros(len(away))
+            weight = scatter**-2 / (1 + far)
+            N += np.einsum("n,nij,nik->jk", weight, rows, rows)
+            y += np.einsum("n,nij,ni->j", weight, rows, observed)
+        x = np.asarray(np.linalg.solve(N, y))
+    few = total / max(total - k, 1)  # so few that they fit by chance
+    return _Fit(x=x, covariance=few * np.linalg.inv(N), left=left[0])
+
+
+def _turned(prior: Prior, back: Array) -> Prior:
+    """A prior whose camera is turned in its own frame."""
+    heading = prior.yaw_deg if np.isfinite(prior.yaw_deg) else 0.0
+    R = back @ cam_R_map_from_angles(heading, prior.pitch_deg, prior.roll_deg)
+    yaw, pitch, roll = angles_from_cam_R_map(R)
+    own = yaw if np.isfinite(prior.yaw_deg) else prior.yaw_deg
+    return replace(prior, yaw_deg=own, pitch_deg=pitch, roll_deg=roll)
+
+
+def off_told(found: Alignment, priors: Sequence[Prior]) -> float:
+    """Median angle in degrees between where photos tell that they look and where they were found;
+    NaN if none tells.
+    """
+    stated = [i for i in found.held if priors[i].sigma_tilt_deg <= STATED_DEG]
+    apart = [np.arccos(np.clip(_told_axis(found, priors[i], i)[2], -1, 1)) for i in stated]
+    return float(np.degrees(np.median(apart))) if apart else np.nan
 
 
 def told_no_tilt(found: Alignment, priors: Sequence[Prior]) -> tuple[Sequence[Prior], str]:
@@ -35,14 +228,7 @@ def told_no_tilt(found: Alignment, priors: Sequence[Prior]) -> tuple[Sequence[Pr
     stated = [i for i in found.held if priors[i].sigma_tilt_deg <= STATED_DEG]
     if len(stated) < FEWEST or 2 * len(stated) < len(found.held):
         return priors, ""
-    cosine = []
-    for i in stated:
-        prior, R = priors[i], found.poses[i].cam_R_map
-        yaw = angles_from_cam_R_map(R)[0]  # that of files may be wrong by itself
-        told = cam_R_map_from_angles(yaw, prior.pitch_deg, prior.roll_deg)
-        cosine.append(float(R[2] @ told[2]))
-    apart = np.arccos(np.clip(cosine, -1, 1))
-    usual = float(np.degrees(np.median(apart)))
+    usual = off_told(found, priors)
     sigma = float(np.median([priors[i].sigma_tilt_deg for i in stated]))
     if usual <= max(FALSE_DEG, FALSE_DEVIATIONS * sigma):
         return priors, ""

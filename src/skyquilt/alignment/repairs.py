@@ -12,7 +12,7 @@ from skyquilt.alignment.crowded_positions import believed
 from skyquilt.alignment.determined import STATED_DEG
 from skyquilt.alignment.displaced_parts import as_taken, brought_together
 from skyquilt.alignment.enlarged import enlarged_note, enlarged_photos, fits_better
-from skyquilt.alignment.false_tilts import told_no_tilt
+from skyquilt.alignment.false_tilts import common_tilts, off_told, told_no_tilt
 from skyquilt.alignment.late_positions import as_moved, mirrored, moved_note, on_time, unshifted
 from skyquilt.alignment.motion import Speeds
 from skyquilt.alignment.oblique import reported_oblique, tilted, turned_deg, without_photos
@@ -49,6 +49,8 @@ AWAY = 0.85
 """Photos that tell their poses, and lie further from their positions than this times their
 deviations in space (median; two thirds are usual), may have been begun wrongly.
 """
+MORE_ALIKE = 0.8
+"""Photos that look nearer to where they say by this factor are told better."""
 BEGUN_AGAIN = 5
 """An oblique survey without camera angles is adjusted again as it was found, so often at most, as
 long as photos come nearer to their positions.
@@ -243,6 +245,19 @@ def _late_moments(last: Tried, survey: Survey) -> Tried:
     return _if_nearer(last, survey, late.priors, "late ", late.note)
 
 
+def _common_tilts(last: Tried, survey: Survey) -> Tried:
+    """Tilts with an error that all photos of a camera have in common are corrected by it."""
+    priors = last.begun.priors
+    corrected, notes = common_tilts(last.found, priors, survey.cameras)
+    if not notes:
+        return last
+    other = survey.tried(last.begun, priors=corrected, name="common tilts ")
+    as_told = off_told(other.found, corrected) < MORE_ALIKE * off_told(last.found, priors)
+    if as_told or off_positions(other.found, priors) < off_positions(last.found, priors):
+        return replace(other, notes=(*last.notes, *notes))
+    return last
+
+
 def _false_tilts(last: Tried, survey: Survey) -> Tried:
     """Tilts that pictures contradict as a whole are not used."""
     if slanting(last.begun.priors):
@@ -346,6 +361,7 @@ REPAIRS: tuple[Callable[[Tried, Survey], Tried], ...] = (
     _cut_pictures,
     _late_positions,
     _late_moments,
+    _common_tilts,
     _false_tilts,
     _guessed_directions,
     _found_directions,
