@@ -83,7 +83,7 @@ def common_tilts(
     together. Of photos that are all headed alike, heights tell a tilt of the map, as far as it is
     not one that may be a drift over the flight.
     """
-    own = [i for i in found.held if priors[i].sigma_tilt_deg <= STATED_DEG]
+    own = [i for i in _largest(found) if priors[i].sigma_tilt_deg <= STATED_DEG]
     told = {i: _told_axis(found, priors[i], i) for i in own}
     own = [i for i in own if told[i][2] > LEAST_INSIDE]
     names = [n for n in dict.fromkeys(cameras) if sum(cameras[i] == n for i in own) >= FEWEST]
@@ -91,28 +91,17 @@ def common_tilts(
     if not own:
         return priors, ()
     camera = np.array([names.index(cameras[i]) for i in own])
-    block_of = {i: number for number, members in enumerate(found.blocks) for i in members}
-    block = np.array([block_of[i] for i in own])
     tangents = np.array([told[i][:2] / told[i][2] for i in own])
-    sigma = np.array([priors[i].sigma_C[2] for i in own])
-    turns = _turns(np.array([found.poses[i].cam_R_map for i in own]), camera, block)
-    fit = _fitted([(turns, tangents, np.radians(LEAST_SCATTER_DEG))])
-    least_deg = COMMON_DEG
+    turns = _turns(np.array([found.poses[i].cam_R_map for i in own]), camera)
+    seen = (turns, tangents, np.radians(LEAST_SCATTER_DEG))
+    fit, least_deg = _fitted(seen), COMMON_DEG
     if any(np.trace(_known(fit, number, least_deg)) < 1.5 for number in range(len(names))):
-        least_deg = FALSE_DEG
         C = np.array([found.poses[i].map_C for i in own])
-        high = np.array([priors[i].map_C[2] for i in own]) - C[:, 2]
-        known = np.isfinite(high)
-        heights = _heights(C, np.array(own), camera, block)[known]
-        least = LEAST_NOISE * float(np.median(sigma[known])) if known.any() else 1.0
-        wide = np.zeros((*turns.shape[:2], heights.shape[2]))
-        wide[..., : turns.shape[2]] = turns
-        fit = _fitted(
-            [
-                (wide, tangents, np.radians(LEAST_SCATTER_DEG)),
-                (heights, high[known][:, None], least),
-            ]
-        )
+        high = np.array([[priors[i].map_C[2]] for i in own]) - C[:, 2:]
+        known = np.isfinite(high[:, 0])
+        scatter = LEAST_NOISE * float(np.median([priors[i].sigma_C[2] for i in own]))
+        heights = (_heights(C, np.array(own), camera)[known], high[known], scatter)
+        fit, least_deg = _fitted(seen, heights), FALSE_DEG
     said, corrected = [], list(priors)
     for number, name in enumerate(names):
         x = _known(fit, number, least_deg) @ fit.x[2 * number : 2 * number + 2]
@@ -139,34 +128,37 @@ def _known(fit: "_Fit", camera: int, least_deg: float) -> Array:
     return np.asarray(axes * told @ axes.T)
 
 
-def _turns(cam_R_map: Array, camera: NDArray[np.int64], block: NDArray[np.int64]) -> Array:
+def _largest(found: Alignment) -> list[int]:
+    """The photos of the largest block."""
+    return sorted(set(found.held).intersection(found.blocks[0] if found.blocks else ()))
+
+
+def _turns(cam_R_map: Array, camera: NDArray[np.int64]) -> Array:
     """(n, 2, k) by how much axes told move in pictures per tangent of an error of their camera (x
-    and y of each camera), and per rad of a turn of the map about its x and y (of each block).
+    and y of each camera), and per rad of a turn of the map about its x and y.
     """
     each, first = np.arange(len(camera)), 2 * (camera.max() + 1)
-    rows = np.zeros((len(camera), 2, first + 2 * (block.max() + 1)))
+    rows = np.zeros((len(camera), 2, first + 2))
     for axis in range(2):
         rows[each, axis, 2 * camera + axis] = 1.0
-        rows[each, 0, first + 2 * block + axis] = -cam_R_map[:, 1, axis]
-        rows[each, 1, first + 2 * block + axis] = cam_R_map[:, 0, axis]
+    rows[:, 0, first:] = -cam_R_map[:, 1, :2]
+    rows[:, 1, first:] = cam_R_map[:, 0, :2]
     return rows
 
 
-def _heights(
-    C: Array, order: NDArray[np.int64], camera: NDArray[np.int64], block: NDArray[np.int64]
-) -> Array:
+def _heights(C: Array, order: NDArray[np.int64], camera: NDArray[np.int64]) -> Array:
     """(n, 1, l) by how many m heights told are above those found per unit of the unknowns of
-    `_turns`, and then per m of an offset of each block, and of a drift of each camera in it.
+    `_turns`, and then per m of an offset and a drift of each camera.
     """
-    cameras, blocks = camera.max() + 1, block.max() + 1
-    first = 2 * (cameras + blocks)
-    rows, each = np.zeros((len(C), 1, first + blocks * (1 + cameras))), np.arange(len(C))
+    cameras = camera.max() + 1
+    first = 2 * cameras + 2
+    rows, each = np.zeros((len(C), 1, first + 2 * cameras)), np.arange(len(C))
     place = C - C.mean(0)
-    rows[each, 0, 2 * (cameras + block)] = -place[:, 1]
-    rows[each, 0, 2 * (cameras + block) + 1] = place[:, 0]
-    rows[each, 0, first + block] = 1.0
+    rows[:, 0, first - 2] = -place[:, 1]
+    rows[:, 0, first - 1] = place[:, 0]
+    rows[each, 0, first + 2 * camera] = 1.0
     late = np.interp(order, [order.min(), max(order.max(), order.min() + 1)], [-1.0, 1.0])
-    rows[each, 0, first + blocks + block * cameras + camera] = late
+    rows[each, 0, first + 2 * camera + 1] = late
     return rows
 
 
@@ -182,22 +174,26 @@ class _Fit:
     """(n,) lengths of what is left of the first group's observations."""
 
 
-def _fitted(groups: Sequence[tuple[Array, Array, float]]) -> _Fit:
-    """The unknowns by groups of observations alike: rows (n, d, k), observed (n, d), and the least
-    that these scatter by.
+def _fitted(*groups: tuple[Array, Array, float]) -> _Fit:
+    """The unknowns by groups of observations alike: rows (n, d, k), of which later groups may have
+    more unknowns, observed (n, d), and the least that these scatter by.
     """
-    k, total = groups[0][0].shape[2], sum(observed.size for _, observed, _ in groups)
+    k = groups[-1][0].shape[2]
+    total = sum(observed.size for _, observed, _ in groups)
     x: NDArray[Any] = np.zeros(k)
     left: list[Array] = []
     for again in range(ROUNDS):
         N, y = np.eye(k) * WIDEST**-2, np.zeros(k)
-        left = [np.linalg.norm(observed - rows @ x, axis=1) for rows, observed, _ in groups]
+        own = [rows @ x[: rows.shape[2]] for rows, _, _ in groups]
+        left = [np.linalg.norm(g[1] - o, axis=1) for g, o in zip(groups, own, strict=True)]
         for (rows, observed, least), away in zip(groups, left, strict=True):
+            if not len(rows):
+                continue
             scatter = max(float(np.median(away)) / MEDIAN_LENGTH[observed.shape[1]], least)
             far = (away / (CUT * scatter)) ** 2 if again else np.zeros(len(away))
-            weight = scatter**-2 / (1 + far)
-            N += np.einsum("n,nij,nik->jk", weight, rows, rows)
-            y += np.einsum("n,nij,ni->j", weight, rows, observed)
+            weight, known = scatter**-2 / (1 + far), slice(rows.shape[2])
+            N[known, known] += np.einsum("n,nij,nik->jk", weight, rows, rows)
+            y[known] += np.einsum("n,nij,ni->j", weight, rows, observed)
         x = np.asarray(np.linalg.solve(N, y))
     few = total / max(total - k, 1)  # so few that they fit by chance
     return _Fit(x=x, covariance=few * np.linalg.inv(N), left=left[0])
