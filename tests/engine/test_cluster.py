@@ -8,6 +8,7 @@ import sys
 import time
 from pathlib import Path
 
+import dask
 import pytest
 
 from skyquilt.engine import cluster as module
@@ -51,6 +52,18 @@ def test_a_worker_that_dies_is_replaced_and_told(two, tmp_path, monkeypatch):
     two.news()
     assert list(two.each(dies_once(tmp_path / "died"), range(12))) == [n * n for n in range(12)]
     assert (tmp_path / "died").exists()
+
+
+@pytest.mark.slow
+def test_a_worker_that_dask_has_given_up_is_started_again(tmp_path, monkeypatch):
+    """As Dask does where the process has not come back some seconds after it died."""
+    monkeypatch.setattr(module, "POLL_S", 0.1)
+    monkeypatch.setattr(module, "PATIENCE_S", 5.0)
+    with (
+        dask.config.set({"distributed.deploy.lost-worker-timeout": "0s"}),
+        cluster("local:1", tmp_path, []) as found,
+    ):
+        assert list(found.each(dies_once(tmp_path / "died"), range(5))) == [0, 1, 4, 9, 16]
 
 
 @pytest.mark.slow

@@ -284,6 +284,7 @@ class Cluster:
         if self._client.status == "running":
             try:
                 found = dict(self._client.nthreads())
+                self._replace(len(found))
             except (OSError, RuntimeError, AttributeError):
                 found = {}
         now = set(found)
@@ -298,6 +299,14 @@ class Cluster:
             self._threads = sum(found.values())
         elif time.monotonic() - self._since > PATIENCE_S:
             raise self._lost()
+
+    def _replace(self, there: int) -> None:
+        """Starts processes of its own again that Dask has given up: those that took long to come
+        back, as on a busy machine, or died as they started.
+        """
+        own = self._client.cluster
+        if own is not None and there < len(own.worker_spec):
+            own.scale(len(own.worker_spec))
 
     def _lost(self) -> SkyquiltError:
         return SkyquiltError(
