@@ -69,7 +69,9 @@ def test_a_picture_of_a_part_of_the_other_is_found_in_it(auto):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shape", [(220, 270), (140, 172)])  # a third and an eighth of a's area
+@pytest.mark.parametrize(  # a third and an eighth of a's area
+    "shape", [(220, 270), pytest.param((140, 172), marks=pytest.mark.long)]
+)
 def test_parts_are_found_both_ways(auto, shape):
     right = 0
     for seed in (12, 14):
@@ -131,7 +133,9 @@ def test_a_good_guess_is_used_and_a_wrong_one_does_no_harm(auto):
 
 
 @pytest.mark.slow  # the quick tests have one in test_register
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize(
+    "seed", [0, 1, 2, 3, *(pytest.param(k, marks=pytest.mark.long) for k in range(4, 8))]
+)
 def test_unrelated_pictures_are_refused_with_figures(auto, seed):
     a = np.clip(spectrum(layout(seed=seed), seed), 0, 255).astype(np.uint8)
     b = np.clip(spectrum(layout(seed=50 + seed), seed), 0, 255).astype(np.uint8)

@@ -97,7 +97,7 @@ CHANGES = {
 BESIDE = (
     {},
     {"method": "image", "levelled": False},
-    {"method": "image", "estimator": "ncc"},
+    pytest.param({"method": "image", "estimator": "ncc"}, marks=pytest.mark.long),
     pytest.param({"method": "hybrid", "optimiser": "anneal"}, marks=pytest.mark.long),
     {"method": "pose", "repair": False},
     {"blend": "first"},

@@ -116,6 +116,7 @@ def test_a_damaged_frame_is_left_out(flight, frames, output, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_frame_that_is_lost_before_it_is_drawn_is_left_out(
     flight, frames, output, tmp_path, monkeypatch
 ):

@@ -47,7 +47,7 @@ def test_bundle_by_every_detector_that_turns_with_the_photos(flight, tmp_path, d
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("detector", ["usurf", "harris"])
+@pytest.mark.parametrize("detector", [pytest.param("usurf", marks=pytest.mark.long), "harris"])
 def test_upright_features_link_photos_of_one_heading_only(flight, tmp_path, detector):
     """Lines are flown to and fro: every line hangs together, none with the next."""
     made = placed(flight, tmp_path, detector=detector, features=1500)

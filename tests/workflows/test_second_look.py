@@ -102,7 +102,7 @@ def other_ground(picture):
     ("change", "said"),
     [
         (ImageOps.mirror, "mirrored"),
-        (ImageOps.flip, "mirrored"),
+        pytest.param(ImageOps.flip, "mirrored", marks=pytest.mark.long),
         (ImageOps.invert, "in negative"),
         (other_ground, None),
     ],
