@@ -30,7 +30,7 @@ from skyquilt.alignment.stages import (
     settled,
     weighed,
 )
-from skyquilt.alignment.start import Start, find_start, ground_of
+from skyquilt.alignment.start import Start, find_start, focals_by_heights, ground_of
 from skyquilt.alignment.tracks import Thinning, Tracks, build_tracks, thin
 from skyquilt.alignment.triangulate import triangulated
 from skyquilt.alignment.unfit_cameras import (
@@ -79,7 +79,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 59
+    version: ClassVar[int] = 60
 
     def __call__(
         self,
@@ -160,8 +160,9 @@ class Bundle:
         features: Sequence[Features],
         links: Sequence[Link],
         keep: Keep,
-    ) -> tuple[Start, Tracks]:
-        """Where the photos that these links connect lie about, and their tracks.
+    ) -> tuple[Sequence[Photo], Start, Tracks, tuple[str, ...]]:
+        """Where the photos that these links connect lie about, and their tracks; the photos as far
+        as that tells their focal lengths, and notes.
 
         Raises:
             AlignmentError: no two photos are linked.
@@ -175,11 +176,14 @@ class Bundle:
             start = _kept_start(photos, priors, features, links, ground, keep)
         if not start.blocks:
             raise AlignmentError(f"none of {len(photos)} photos could be linked to another one")
-        some = None
+        said, some = tuple[str, ...](), None
+        if self.repair:
+            photos, start, said = focals_by_heights(photos, priors, start, ground)
         if len(start.placed) > self.many:
             sizes = [(p.width, p.height) for p in photos]
             some = Thinning(sizes=sizes, per_photo=self.ties, least=self.ties // 2)
-        return start, keep("tracks", lambda: build_tracks(features, start.links, thinning=some))
+        tracks = keep("tracks", lambda: build_tracks(features, start.links, thinning=some))
+        return photos, start, tracks, said
 
     def _block(
         self,
@@ -195,7 +199,7 @@ class Bundle:
     ) -> Alignment:
         """Adjusts the photos that these links connect."""
         priors = begun.told
-        start, tracks = self._begun(photos, frame, begun, features, links, keep)
+        photos, start, tracks, said = self._begun(photos, frame, begun, features, links, keep)
         sizes = [(p.width, p.height) for p in photos]
         large = len(start.placed) > self.many
         setup = set_up(photos, priors, start, distortion=self.distortion, repair=self.repair)
@@ -232,11 +236,10 @@ class Bundle:
         for step in fine_steps(keep.within("fine"), near):
             problem, state = step(problem, state)
         make_room()
-        said = tuple[str, ...]()
         if self.repair:
             found = upside_down(problem, state, setup, keep.within("turned"))
             if found.rows.any():
-                said = (turned_note([photos[i].name for i in setup.members[found.rows]]),)
+                said += (turned_note([photos[i].name for i in setup.members[found.rows]]),)
                 problem, state, setup = found.problem, found.state, found.setup
                 aside = SetAside(found.turned_tracks(aside.get()), large=large)
         setup = setup.moving_as(photos, state.C)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skyquilt.alignment.determined import STATED_DEG
 from skyquilt.alignment.inputs import AlignmentInputs
@@ -23,6 +24,10 @@ times further apart, seen from the height that they report, ...
 LEAST_HEIGHT_M = 8.0
 """... or from this height, where they report none: with positions that crowd, the map would show
 photos taken from below 2 m.
+"""
+FEWEST_ALIKE, ALIKE = 6, 0.7
+"""Positions that crowd do not lie as the pictures show the photos: so many photos, by so large a
+share of the square of their distances from the middle.
 """
 FROM_ONE_PLACE_DEG = 5.0
 """Matched rays that differ by no more, in the median, by the angles that photos report, were taken
@@ -54,9 +59,12 @@ def without_crowded(inputs: AlignmentInputs) -> tuple[AlignmentInputs, tuple[str
     bare, ground = without_places(told), ground_of(inputs.frame)
     start = find_start(inputs.photos, bare, inputs.features, inputs.links, ground)
     scale = 1.0 if start.metric else LEAST_HEIGHT_M / NOMINAL_HEIGHT_M
-    block = [start.placed[m][1] for m in max(start.blocks, key=len, default=())]
-    shown = scale * reach_of(np.array([(t.real, t.imag) for t in block]).reshape(-1, 2))
-    if not shown > FURTHER * reach:
+    block = max(start.blocks, key=len, default=())
+    places = np.array([start.placed[m][1] for m in block], complex)
+    shown = scale * reach_of(np.column_stack([places.real, places.imag]))
+    if not shown > FURTHER * reach or _as_shown(
+        places, np.array([told[m].map_C[:2] for m in block])
+    ):
         return inputs, ()
     control = sum(not point.check for point in inputs.control) >= FEWEST_CONTROL
     frame = inputs.frame if control else unplaced(inputs.frame)
@@ -66,6 +74,21 @@ def without_crowded(inputs: AlignmentInputs) -> tuple[AlignmentInputs, tuple[str
         " were not used. Provide positions in a geo.txt, or control points."
     )
     return replace(inputs, priors=bare, frame=frame), (note,)
+
+
+def _as_shown(places: NDArray[np.complex128], xy: NDArray[np.float64]) -> bool:
+    """Whether positions (n, 2) lie as the pictures show the photos (n), but nearer to each other:
+    then heights or a guessed focal length are wrong, such as that of a long lens.
+    """
+    known = np.isfinite(xy).all(1)
+    if known.sum() < FEWEST_ALIKE:
+        return False
+    a, b = places[known], xy[known] @ (1, 1j)
+    a, b = a - a.mean(), b - b.mean()
+    alike = abs(np.vdot(a, b)) ** 2 / max(
+        float((np.abs(a) ** 2).sum() * (np.abs(b) ** 2).sum()), 1e-9
+    )
+    return bool(alike > ALIKE)
 
 
 def unplaced(frame: MapFrame) -> MapFrame:

@@ -45,6 +45,16 @@ SCATTER = 10.0
 """unless they lie further apart than so many deviations: then they are no errors of a receiver.
 """
 
+NARROW = 1.6
+"""A guessed focal length that is shorter than heights tell by more than this factor is wrong."""
+LEAST_FOCAL_M = 10.0
+"""Heights above ground of less do not tell it: take-off lies elsewhere by some metres,"""
+FEWEST_FOCAL, FOCAL_SPREAD, FOCAL_SCALE = 5, 0.15, 0.2
+"""nor do fewer photos, nor some that differ by more than this share (median), nor positions that
+leave the scale less certain than this share.
+"""
+FOCAL_SHARE = 0.2
+"""Deviation of a focal length that heights tell, as a share of it: ground is uneven."""
 GROSS_DEG = 20.0
 """A heading that is off by more is false."""
 UNKNOWN_YAW_DEG = 90.0
@@ -53,6 +63,10 @@ LOOSEST_DEG = 20.0
 """Deviation of a heading at most, where many share one error."""
 ALIKE_DEG = 20.0
 """Headings are off by one angle if most of them are off by about as much."""
+FOCAL_NOTE = (
+    "No file tells the focal length of {0}: heights above take-off and the ground between positions"
+    " tell about {1:.0f} px, and heights of the map are as good as that."
+)
 FEWEST_HEADINGS = 3
 """Fewer headings do not tell what they have in common."""
 
@@ -133,6 +147,62 @@ def find_start(
         georeferenced=frozenset(georeferenced),
         metric=metric,
     )
+
+
+def focals_by_heights(
+    photos: Sequence[Photo], priors: Sequence[Prior], start: Start, ground_m: float
+) -> tuple[Sequence[Photo], Start, tuple[str, ...]]:
+    """Photos of cameras whose focal length is a guess that is far too short, with the one that
+    heights above take-off and the ground between positions tell; the start with these, and notes.
+
+    Photos that look straight down fit a short lens near the ground as well as a long one high
+    above it: the adjustment would stay near the guess. `ground_m`: see `find_start`.
+    """
+    sized: dict[str, list[float]] = {}
+    for block in start.blocks if start.metric and not start.in_space else ():
+        if not _scaled(block, priors, start):
+            continue
+        for i in block:
+            own, height = photos[i], priors[i].map_C[2] - ground_m
+            bare = own.calibration is None and own.shown_lens is None
+            if bare and own.focal.source == "guess" and height > LEAST_FOCAL_M:
+                sized.setdefault(own.camera_key, []).append(height / abs(start.placed[i][0]))
+    factors: dict[str, float] = {}
+    for camera, found in sized.items():
+        factor = float(np.median(found))
+        spread = float(np.median(np.abs(np.array(found) / factor - 1)))
+        if len(found) >= FEWEST_FOCAL and factor > NARROW and spread < FOCAL_SPREAD:
+            factors[camera] = factor
+    if not factors:
+        return photos, start, ()
+    told, said = list(photos), []
+    placed = dict(start.placed)
+    for i, photo in enumerate(photos):
+        factor = factors.get(photo.camera_key, 1.0)
+        if factor == 1.0:
+            continue
+        px = photo.focal.px * factor
+        told[i] = replace(photo, focal=replace(photo.focal, px=px, sigma_px=FOCAL_SHARE * px))
+        if i in placed:
+            placed[i] = (placed[i][0] * factor, placed[i][1])
+    for camera in factors:
+        px = next(p.focal.px for p in told if p.camera_key == camera)
+        said.append(FOCAL_NOTE.format(camera, px))
+    return told, replace(start, placed=placed), tuple(said)
+
+
+def _scaled(block: Sequence[int], priors: Sequence[Prior], start: Start) -> bool:
+    """Whether positions tell the scale of a block to `FOCAL_SCALE`, by how far they lie from where
+    the start put the photos.
+    """
+    own = [i for i in block if np.isfinite(priors[i].map_C[:2]).all()]
+    if len(own) < FEWEST_FOCAL:
+        return False
+    there = np.array([start.placed[i][1] for i in own])
+    told = np.array([priors[i].map_C[:2] @ (1, 1j) for i in own])
+    off = np.abs(told - there)
+    wide = np.abs(there - there.mean())
+    return bool(np.sqrt((off**2).mean() / len(own)) < FOCAL_SCALE * np.sqrt((wide**2).mean()))
 
 
 def _consistent_blocks(
