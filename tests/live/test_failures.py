@@ -399,7 +399,7 @@ def test_a_stored_photo_that_is_lost_is_told_and_taken_again(flight, tmp_path):
 
 def test_the_final_map_names_photos_whose_files_are_gone(flight, tmp_path, monkeypatch):
     seen = []
-    monkeypatch.setattr(final_map, "iter_mosaic", lambda paths, *_, **__: seen.append(paths) or ())
+    monkeypatch.setattr(final_map, "iter_bands", lambda paths, *_, **__: seen.append(paths) or ())
     live = LiveMap(tmp_path / "out", QUICK)
     for path in flight.photos[:3]:
         live.intake.take_file(path, "drone")

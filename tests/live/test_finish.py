@@ -43,7 +43,7 @@ def test_the_final_map_takes_every_photo_that_was_taken(flight, tmp_path, monkey
 
     seen = []
     monkeypatch.setattr(
-        final_map, "iter_mosaic", lambda _, __, asked, **___: seen.append(asked) or ()
+        final_map, "iter_bands", lambda _, __, asked, **___: seen.append(asked) or ()
     )
     settings = LiveSettings(most_mp=500.0)
     live = LiveMap(tmp_path / "out", settings)

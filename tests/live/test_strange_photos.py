@@ -3,11 +3,12 @@
 import io
 
 import numpy as np
+import piexif
 import pytest
 from PIL import Image
 
+from skyquilt.live import final_map
 from skyquilt.live.live_map import LiveMap
-from skyquilt.live.photo_intake import Accepted, Refused
 from skyquilt.live.settings import LiveSettings
 from tests.photos.conftest import jpeg_bytes, pixels
 
@@ -18,42 +19,84 @@ XMP = (
 )
 
 
-def shots(count):
-    """Three bands of each shot, in the order in which cameras write them, and a colour photo."""
+def bands(count):
+    """Three bands of each shot, in the order in which cameras write them."""
     for shot in range(count):
         for band, name in enumerate(("Blue", "Green", "NIR")):
             grey = pixels(seed=shot)[..., band]
             yield f"{shot}_{band}.jpg", jpeg_bytes(grey, xmp=XMP.format(name))
-    yield "colour.jpg", jpeg_bytes(pixels(seed=99))
+
+
+def states(live):
+    return dict(live.ledger.rows("select name, state from photo order by id"))
+
+
+def worked(live, files):
+    """States of all photos after the map has worked on these, too."""
+    for name, content in files:
+        assert live.intake.take([content], name, "drone")
+    for _ in live.drain():
+        pass
+    return states(live)
 
 
 @pytest.mark.parametrize(("asked", "shown"), [(None, 0), ("NIR", 2)])
 def test_one_band_of_a_multispectral_camera_is_mapped(tmp_path, asked, shown):
     for part in range(2):  # the second time it is continued
         live = LiveMap(tmp_path / "out", LiveSettings(band=asked))
-        told = {n: live.intake.take([b], n, "drone") for n, b in shots(2 + part)}
+        told = {n: live.intake.take([b], n, "drone") for n, b in bands(2 + part)}
+        found = states(live)
         live.close()
-    taken = {n for n, t in told.items() if isinstance(t, Accepted)}
-    assert taken == {f"{shot}_{shown}.jpg" for shot in range(3)}
-    other = told["1_1.jpg"]
-    assert isinstance(other, Refused)
-    assert (
-        other.reason
-        == f"it shows the band green; the map shows {['blue', '', 'nir'][shown]} (--band)"
+    assert {n for n, s in found.items() if s != "kept"} == {f"{k}_{shown}.jpg" for k in range(3)}
+    own, other = ("blue", "nir")[:: 1 - shown]
+    assert told[f"2_{2 - shown}.jpg"].kept == (
+        f"it shows the band {other}; the map shows the band {own} (--band), and the final map may"
+        " use it"
     )
 
 
-def test_photos_in_colours_that_come_first_are_mapped_without_bands(tmp_path):
-    """As drones write them that have a camera in colours beside those of the bands."""
+def test_photos_in_colours_are_mapped_whatever_band_came_first(tmp_path, monkeypatch):
+    """As drones write them that have a camera in colours beside those of the bands. The final map
+    takes all.
+    """
     live = LiveMap(tmp_path / "out", LiveSettings())
-    photos = [("colour.jpg", jpeg_bytes(pixels(seed=99))), *shots(1)]
-    told = {n: live.intake.take([b], n, "drone") for n, b in dict(photos).items()}
-    notes = live.ledger.rows("select body from event where kind = 'note'")
+    assert worked(live, bands(1)) == {"0_0.jpg": "waiting", "0_1.jpg": "kept", "0_2.jpg": "kept"}
+    found = worked(live, [("colour.jpg", jpeg_bytes(pixels(seed=99)))])
+    assert found == {n: "kept" for n, _ in bands(1)} | {"colour.jpg": "waiting"}
     live.close()
-    assert {n for n, t in told.items() if isinstance(t, Accepted)} == {"colour.jpg"}
-    assert isinstance(told["0_0.jpg"], Refused)
-    assert "the map shows the photos in colours (--band)" in told["0_0.jpg"].reason
-    assert not any("came first" in body for (body,) in notes)
+    live = LiveMap(tmp_path / "out", LiveSettings())  # continued
+    assert [m.photo.name for m in live.members.by_id.values()] == ["colour.jpg"]
+    told = live.ledger.rows("select body from event where kind = 'note' and body like '%again%'")
+    assert len(told) == 1 and "begun again with the photos in colours" in told[0][0]
+    live.close()
+    seen = []
+    monkeypatch.setattr(final_map, "iter_bands", lambda paths, *_, **__: seen.extend(paths) or ())
+    list(final_map.iter_finish(live.folder, live.settings))
+    assert {p.name for p in seen} == set(found)
+
+
+def test_the_band_of_most_files_is_mapped_whatever_came_first(tmp_path):
+    """A band file that was left on the card. A file that is written anew replaces the former, of a
+    band that the map does not show, too.
+    """
+    live = LiveMap(tmp_path / "out", LiveSettings())
+    files = dict(bands(4))
+    worked(live, [(n, files[n]) for n in ("0_2.jpg", "0_0.jpg", "0_1.jpg", "1_0.jpg")])
+    found = worked(live, [("2_0.jpg", files["2_0.jpg"])])
+    assert [n for n, s in found.items() if s == "waiting"] == ["0_0.jpg", "1_0.jpg", "2_0.jpg"]
+    assert found["0_2.jpg"] == found["0_1.jpg"] == "kept"
+    live.close()
+
+
+def test_a_kept_file_that_is_written_anew_replaces_the_former(flight, tmp_path):
+    live = LiveMap(tmp_path / "out", LiveSettings(band="red"))
+    with Image.open(flight.photos[1]) as photo:
+        exif, grey = piexif.load(photo.info["exif"]), np.array(photo.convert("L"))
+    for k in range(2):
+        file = jpeg_bytes(grey + np.uint8(k), exif=exif, xmp=XMP.format("NIR"))
+        assert live.intake.take([file], "a.jpg", "drone").kept
+    assert [s for (s,) in live.ledger.rows("select state from photo order by id")] == ["superseded", "kept"]
+    live.close()
 
 
 @pytest.mark.parametrize("tone", [3, 252])

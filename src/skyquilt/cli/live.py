@@ -94,7 +94,7 @@ def command(
         str | None,
         typer.Option(
             help="Band that the map shows, of cameras that write a file for each, e.g. nir.",
-            show_default="(that of the first file)",
+            show_default="of the first file, or of most",
         ),
     ] = None,
     shutter: Shutter = None,

@@ -1,5 +1,5 @@
-"""The end of a flight: the batch workflow runs on the accepted photos and reuses the features that
-were already computed.
+"""The end of a flight: the batch workflow runs on the accepted photos, those of all bands too, and
+reuses the features that were already computed.
 """
 
 import os
@@ -13,10 +13,10 @@ from skyquilt.live.ledger import Ledger
 from skyquilt.live.live_map import FINISHED, PHOTOS
 from skyquilt.live.settings import LiveSettings
 from skyquilt.model.event import Event, Note
+from skyquilt.multispectral.workflow import iter_bands
 from skyquilt.outside import is_file, remove_folder
 from skyquilt.photos.side_rows import sentence_of
 from skyquilt.settings import MosaicSettings
-from skyquilt.workflows.mosaic import iter_mosaic
 
 NAMED = "named"
 """Folder with links to the photos under readable names, for the files of the final map."""
@@ -29,7 +29,7 @@ def iter_finish(folder: Path, settings: LiveSettings) -> Iterator[Event]:
     """Makes the batch mosaic in `folder/finished`; the live map is not changed.
 
     Raises:
-        SkyquiltError: as `iter_mosaic`; NoPhotosError if no photo was accepted.
+        SkyquiltError: as `iter_bands`; NoPhotosError if no photo was accepted.
     """
     ledger = Ledger(folder, write=False)
     try:
@@ -56,6 +56,7 @@ def iter_finish(folder: Path, settings: LiveSettings) -> Iterator[Event]:
         features=settings.features,
         crs=settings.crs,
         thermal_unit=settings.thermal_unit,
+        band=settings.band,
         shutter=settings.shutter,
         shutter_readout_ms=settings.shutter_readout_ms,
         vertical_datum=settings.vertical_datum,
@@ -64,7 +65,9 @@ def iter_finish(folder: Path, settings: LiveSettings) -> Iterator[Event]:
     )
     # if the final map is requested again after more photos have arrived, it is made anew; results
     # computed before are reused from the store, and the former map is shown until then
-    yield from iter_mosaic(paths, folder / FINISHED, wanted, overwrite=True, stays=True)
+    yield from iter_bands(
+        paths, folder / FINISHED, wanted, overwrite=True, stays=True, needed=False
+    )
 
 
 def named(folder: Path, photos: list[tuple[int, str, str]]) -> tuple[list[Path], list[str]]:

@@ -15,6 +15,7 @@ from skyquilt.live.drone_metadata import Metadata
 from skyquilt.live.events import MapEvents, Update
 from skyquilt.live.ledger import hit
 from skyquilt.live.members import FAR_M, Member, Queues, about_record
+from skyquilt.live.photo_intake import BAND, OTHER_BAND, of_other_band
 from skyquilt.live.redraw_queue import RedrawQueue
 from skyquilt.ortho.ground import round_gsd
 from skyquilt.outside import whole
@@ -132,18 +133,51 @@ class InitialPose:
                 " them"
             )
         self.redraw.clear()
-        with self.ledger.change() as db:
-            for table in ("height", "camera", "link")[: None if member is not None else 2]:
-                db.execute(f"delete from {table}")
-            for key in ("frame", "gsd", "cell", "ground", SCHEDULE):
-                db.execute("delete from meta where key = ?", (key,))
+        with self.ledger.change():
+            self._all_off(keep=member is None)
             if member is not None:
                 self.ledger.put_meta(BEGAN, member.id)
-            for m in self.members.by_id.values():
-                self._off(m, keep=member is None)
             self.ledger.tell("note", {"text": f"{text}."})
         hit("map begun again")
         return Update(what="noted", photo=member.id if member is not None else None, text=text)
+
+    def other_band(self) -> Update:
+        """As `begin_again`, for a map of the band that it shall show from now on
+        (`photo_intake.OTHER_BAND`): files of it that were kept are received, and those of others
+        kept.
+        """
+        self.redraw.clear()
+        with self.ledger.change() as db:
+            self._all_off(keep=False)
+            db.execute("delete from meta where key in (?, ?)", (BEGAN, OTHER_BAND))
+            shown = str(self.ledger.meta(BAND))
+            for number, name, source, state, band in self.ledger.rows(
+                "select photo.id, photo.name, source, state, band.name from photo join band on"
+                " photo = id where state in ('received', 'kept') order by id"
+            ):
+                reason = of_other_band(band, shown)
+                now = "kept" if reason else "received"
+                if now != state:
+                    self.ledger.set_photo(number, state=now, reason=reason)
+                    said = {"id": number, "name": name, "source": source, "state": now}
+                    self.ledger.tell("photo", {**said, "reason": reason})
+            more = f"files of the band {shown}, of which there are more"
+            text = f"the map is begun again with the {more if shown else 'photos in colours'}"
+            self.ledger.tell("note", {"text": f"{text} (--band)."})
+        hit("map begun again")
+        return Update(what="noted", text=text)
+
+    def _all_off(self, *, keep: bool) -> None:
+        """Takes all photos off the map and forgets what it is (inside a transaction); with `keep`
+        they stay compared.
+        """
+        with self.ledger.change() as db:
+            for table in ("height", "camera", "link")[: 2 if keep else None]:
+                db.execute(f"delete from {table}")
+            for key in ("frame", "gsd", "cell", "ground", SCHEDULE):
+                db.execute("delete from meta where key = ?", (key,))
+            for m in self.members.by_id.values():
+                self._off(m, keep=keep)
 
     def _off(self, member: Member, *, keep: bool) -> None:
         """Takes a photo off the map (inside a transaction); with `keep` it stays compared."""

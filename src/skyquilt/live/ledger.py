@@ -82,11 +82,13 @@ create table if not exists height(col integer, row integer, z real not null,
 create table if not exists event(seq integer primary key autoincrement, at real not null,
   kind text not null, body text not null);
 create table if not exists layer(name text primary key, body text not null, at real not null);
+create table if not exists band(photo integer primary key, name text not null);
 create table if not exists seen(path text primary key, size integer not null,
   mtime integer not null);
 create index if not exists photo_state on photo(state);
 create index if not exists photo_shot on photo(shot);
 create index if not exists link_b on link(b);
+create index if not exists band_name on band(name);
 """
 
 
@@ -275,6 +277,7 @@ class Ledger:
         with self.change() as db:
             own = "in (select id from photo where digest = ? and state = 'refused')"
             db.execute(f"delete from link where a {own} or b {own}", (digest, digest))
+            db.execute(f"delete from band where photo {own}", (digest,))
             db.execute(f"delete from photo where id {own}", (digest,))
 
     def lost(self, photo: int, name: str, source: str, reason: str) -> None:

@@ -10,6 +10,7 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,7 @@ from skyquilt.live.links import LiveLinks
 from skyquilt.live.local_pose import LocalPose
 from skyquilt.live.members import Members, Queues
 from skyquilt.live.neighbours import Neighbours
-from skyquilt.live.photo_intake import Intake, Refused
+from skyquilt.live.photo_intake import OTHER_BAND, Intake, Refused
 from skyquilt.live.placeless import Placeless
 from skyquilt.live.redraw_queue import RedrawQueue
 from skyquilt.live.refinement import Refinement
@@ -180,9 +181,8 @@ class LiveMap:
         done = self.intake.take_file(path, source or path.parent.name)
         if isinstance(done, Refused):
             return Update(what="refused", text=f"{done.name}: {done.reason}")
-        last = Update(
-            what="noted", photo=done.id, text="it was already received" if done.duplicate else ""
-        )
+        text = "it was already received" if done.duplicate else done.kept
+        last = Update(what="noted", photo=done.id, text=text)
         for update in self.drain():
             if update.photo == done.id and update.what != "drawn":
                 last = update
@@ -314,9 +314,14 @@ class LiveMap:
         first = self.queues.received[0]
         if first.id % TIDY == 0:
             give_back()
-        if self.initial_pose.elsewhere(first):
+        again = None
+        if self.ledger.meta(OTHER_BAND):
+            again = self.initial_pose.other_band
+        elif self.initial_pose.elsewhere(first):
+            again = partial(self.initial_pose.begin_again, first)
+        if again is not None:
             self.background.stop()
-            update = self.initial_pose.begin_again(first)
+            update = again()
             self._reload()
             return update
         with concerning(first.id):

@@ -57,7 +57,7 @@ class Member:
     source: str
     """The folder or drone that it came from."""
     state: str
-    """received, waiting, placed, refined, superseded or refused."""
+    """received, waiting, placed, refined, superseded or refused (no member is `kept`)."""
     pose: Pose | None = None
     """Its pose."""
     camera: str = ""
@@ -200,7 +200,7 @@ class Members:
         """Photos that were accepted since the last call, in order."""
         query = (
             "select id, name, source, file, state, pose, camera, about from photo where id > ?"
-            " order by id"
+            " and state != 'kept' order by id"
         )
         new = []
         for number, name, source, file, state, pose, camera, about in self.ledger.rows(

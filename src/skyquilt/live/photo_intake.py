@@ -17,12 +17,20 @@ from skyquilt.live.settings import LiveSettings
 from skyquilt.model.bands import canonical
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.outside import open_regular, plain
-from skyquilt.photos.left_out import IS_MAP
+from skyquilt.photos.left_out import AS_MANY, IS_MAP
 from skyquilt.photos.read import read_photo, rejected
 from skyquilt.video.srt import MOST_TELEMETRY_BYTES
 
 NAME = 200
 """Largest number of characters of a name that are kept."""
+MORE = 2
+"""Another band is shown where more than so many times as many files are of it as of the one shown;
+of photos in colours as many are enough as for a batch map.
+"""
+BAND, OTHER_BAND = "band", "other band due"
+"""Names in the ledger: the band that the map shows, empty for photos in colours; whether the map
+must be begun again with it.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +43,8 @@ class Accepted:
     """Its name."""
     duplicate: bool = False
     """True if the same file was received before."""
+    kept: str = ""
+    """Why the map does not show it, and it is kept for the final map only; empty for others."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,9 +165,6 @@ class Intake:
             known = self.ledger.row("select id, name from photo where digest = ?", arrived.digest)
             if known is not None:
                 return Accepted(id=int(known[0]), name=str(known[1]), duplicate=True)
-            if reason := self._of_other_band(photo):
-                gone(arrived.path)
-                return self.refuse(name, source, reason)
             same = self.ledger.rows(
                 "select id, name, width from photo where shot = ? and (width != ? or (name = ? and"
                 " source = ?)) and state not in ('superseded', 'refused')",
@@ -172,10 +179,16 @@ class Intake:
                 return self.refuse(
                     name, source, f"it is a smaller copy of {larger}, which was already received"
                 )
+            kept = self._of_other_band(photo)
+            for number, _, _ in same:  # what the map does not know gives way at once
+                db.execute(
+                    "update photo set state = 'superseded' where id = ? and state = 'kept'",
+                    (number,),
+                )
             cursor = db.execute(
                 "insert into photo(digest, name, source, file, bytes, received, shot, width, state,"
-                " about)"
-                " values (?, ?, ?, ?, ?, ?, ?, ?, 'received', ?)",
+                " reason, about)"
+                " values (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
                 (
                     arrived.digest,
                     name,
@@ -185,31 +198,67 @@ class Intake:
                     time.time(),
                     shot,
                     photo.width,
+                    "kept" if kept else "received",
+                    kept,
                     json.dumps({"preview": [int(i) for i, _, _ in same]}),
                 ),
             )
             number = int(cursor.lastrowid or 0)
+            if photo.in_colours or photo.shows_a_band:
+                db.execute("insert into band values (?, ?)", (number, _band(photo)))
             said = {"id": number, "name": name, "source": source, "state": "received"}
-            self.ledger.tell("photo", said)
+            self.ledger.tell("photo", said | ({"state": "kept", "reason": kept} if kept else {}))
         hit("photo row committed")
-        return Accepted(id=number, name=name)
+        return Accepted(id=number, name=name, kept=kept)
 
     def _of_other_band(self, photo: Photo) -> str:
-        """The reason why the map leaves a photo out that shows another band than it does, or
-        colours; empty for others. It shows the band that is asked for, or what came first: a map of
-        all would be a patchwork of them.
+        """The reason why the map does not show a photo, which shows another band than it does, or
+        colours; empty for others. It shows the band that is asked for, or what came first, until
+        there is more of another: a map of all would be a patchwork of them.
         """
         if not (photo.in_colours or photo.shows_a_band):
             return ""
         asked = self.settings.band
-        shown = self.ledger.meta("band") if asked is None else canonical(asked.lower())
+        shown = self.ledger.meta(BAND) if asked is None else canonical(asked.lower())
+        own = _band(photo)
         if shown is None:
-            shown = photo.band_name if photo.shows_a_band else ""
-            self.ledger.put_meta("band", shown)
+            shown = own
+            self.ledger.put_meta(BAND, shown)
             if shown:
-                text = f"files of the band {shown} came first: the map shows it, and no other"
-                self.ledger.tell("note", {"text": f"{text} (--band)"})
-        return photo.other_band(str(shown))
+                text = f"files of the band {shown} came first: the map shows it"
+                text = f"{text}, and those of other bands are kept for the final map (--band)"
+                self.ledger.tell("note", {"text": text})
+        elif asked is None and own != shown and self._overtakes(own, str(shown)):
+            shown = own
+            self.ledger.put_meta(BAND, shown)
+            self.ledger.put_meta(OTHER_BAND, True)
+        return of_other_band(own, str(shown))
+
+    def _overtakes(self, band: str, shown: str) -> bool:
+        """Whether the map is better of a band, of which another file has come, than of what it
+        shows.
+        """
+        query = "select count(*) from band where name = ?"
+        own, others = (self.ledger.rows(query, name)[0][0] for name in (band, shown))
+        if not band:
+            return bool(own + 1 >= AS_MANY * others)
+        return bool(own + 1 > MORE * (others if shown else others / AS_MANY))
+
+
+def _band(photo: Photo) -> str:
+    """The band that a photo shows, empty for colours."""
+    return photo.band_name if photo.shows_a_band else ""
+
+
+def of_other_band(band: str, shown: str) -> str:
+    """Why a map of the band `shown` does not show a file of a band, either empty for photos in
+    colours; empty if it does.
+    """
+    if band == shown:
+        return ""
+    own = f"it shows the band {band}" if band else "it is in colours"
+    instead = f"the band {shown}" if shown else "the photos in colours"
+    return f"{own}; the map shows {instead} (--band), and the final map may use it"
 
 
 def shot_of(photo: Photo) -> str:
@@ -222,4 +271,4 @@ def shot_of(photo: Photo) -> str:
     camera = " ".join(part for part in photo.camera_key.split() if part != size)
     shape = round(photo.width / photo.height, 1)
     place = f"{photo.position.latitude_deg:.7f} {photo.position.longitude_deg:.7f}"
-    return f"{camera}|{photo.band}|{shape}|{photo.time.isoformat()}|{place}"
+    return f"{camera}|{photo.band_name or photo.band}|{shape}|{photo.time.isoformat()}|{place}"

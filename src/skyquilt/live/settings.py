@@ -50,7 +50,7 @@ class LiveSettings:
     """
     band: str | None = None
     """Band that the map shows, of cameras that write a file for each; None = that of the first
-    file.
+    file, until there are more of another.
     """
     shutter: str | None = None
     """One of `settings.SHUTTERS`: how the cameras expose; None = as metadata and table of cameras

@@ -47,11 +47,15 @@ def iter_bands(
     *,
     overwrite: bool = False,
     rerun_from: str | None = None,
+    stays: bool = False,
+    needed: bool = True,
 ) -> Iterator[Event]:
     """Makes the map, then `bands.tif` and indices of vegetation; the last event is the `Result`.
+    `stays`: see `iter_mosaic`. Unless they are `needed`, a flight without other bands is mapped
+    without them.
 
     Raises:
-        UsageError: no file says that it shows one band of several.
+        UsageError: no file says that it shows one band of several, which is needed.
         SkyquiltError: any other error that the user can correct.
     """
     settings, began = instance("settings", settings, MosaicSettings), Clock.now()
@@ -59,7 +63,7 @@ def iter_bands(
     files = ReadFiles(Store(folder=output / STATE / "store", registry=REGISTRY))
     given = read_input(folder, settings.input, files)
     others = given.survey.other_bands
-    if not others:
+    if needed and not others:
         raise UsageError(
             "--all-bands needs files that each show one band of a multispectral camera and say so"
             " (BandName in their XMP); these do not. Files that hold several bands each, as MAPIR's"
@@ -73,8 +77,12 @@ def iter_bands(
         began=began,
         overwrite=overwrite,
         rerun_from=rerun_from,
+        stays=stays,
     )
-    yield from _bands(made, others)
+    if others:
+        yield from _bands(made, others)
+    else:
+        yield made.result
 
 
 def _without_reasons(given: SurveyInput, others: Sequence[Photo]) -> SurveyInput:

@@ -268,18 +268,18 @@ def _nameless(photos: Sequence[Photo]) -> dict[str, str]:
         for p in photos
         if p.channels == 1 and not (p.band_name or p.unit) and (p.width, p.height, p.dtype) in like
     ]
-    few = len(found) < _AS_MANY * max(bands_of(photos).values(), default=0)
+    few = len(found) < AS_MANY * max(bands_of(photos).values(), default=0)
     return dict.fromkeys(found, NAMELESS) if few else {}
 
 
-_AS_MANY = 0.5
+AS_MANY = 0.5
 """Photos in colours are the map where there are at least so many times as many as of a band."""
 
 
 def _in_colours(photos: Sequence[Photo]) -> bool:
     """Whether photos in colours are about as many as files of the commonest band."""
     colours = sum(p.in_colours for p in photos)
-    return colours > _AS_MANY * max(bands_of(photos).values(), default=0)
+    return colours > AS_MANY * max(bands_of(photos).values(), default=0)
 
 
 def _usual(photos: Sequence[Photo]) -> str:

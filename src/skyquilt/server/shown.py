@@ -21,7 +21,7 @@ class Shown:
     name: str
     """Name of the photo; must be escaped in HTML."""
     state: str
-    """received, waiting, placed, refined, superseded or refused."""
+    """received, kept, waiting, placed, refined, superseded or refused."""
     record: Mapping[str, Any]
     """All data that are sent to viewers."""
     ring: tuple[tuple[float, float], ...]

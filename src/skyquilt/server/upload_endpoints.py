@@ -64,6 +64,7 @@ class UploadEndpoints:
         if isinstance(done, Waiting):
             return JSONResponse({"name": done.name, "state": _state(done)}, 202)
         said = {"id": done.id, "name": done.name, "state": _state(done)}
+        said |= {"reason": done.kept} if done.kept else {}
         return JSONResponse(said, 200 if done.duplicate else 201)
 
     # -- in parts (tus)
@@ -289,7 +290,7 @@ def _no_room(error: OSError) -> HTTPException:
 def _state(done: Accepted | Waiting) -> str:
     if isinstance(done, Waiting):
         return "waiting"
-    return "duplicate" if done.duplicate else "received"
+    return "duplicate" if done.duplicate else "kept" if done.kept else "received"
 
 
 def _refusal(done: Refused) -> JSONResponse:
