@@ -95,7 +95,7 @@ def test_a_kept_file_that_is_written_anew_replaces_the_former(flight, tmp_path):
     for k in range(2):
         file = jpeg_bytes(grey + np.uint8(k), exif=exif, xmp=XMP.format("NIR"))
         assert live.intake.take([file], "a.jpg", "drone").kept
-    assert [s for (s,) in live.ledger.rows("select state from photo order by id")] == ["superseded", "kept"]
+    assert live.ledger.rows("select state from photo order by id") == [("superseded",), ("kept",)]
     live.close()
 
 
