@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.determined import STATED_DEG
 from skyquilt.alignment.start import ground_of
 from skyquilt.live.drone_metadata import Metadata
 from skyquilt.live.members import Member, Members
@@ -18,6 +19,10 @@ STRANGERS = 2
 """Photos of blocks that a photo is not linked with, with which it is compared besides."""
 CELL_M = 30.0
 """Side of the cells of the index in m."""
+GUESSED = 2
+"""Number of photos that came next, with which one is compared that does not tell its tilt, where
+fewer than so many seem near: taken to look down, it and the ground below it may be elsewhere.
+"""
 
 
 class Neighbours:
@@ -51,11 +56,15 @@ class Neighbours:
 
     def of(self, member: Member, pose: Pose | None, most: int = NEIGHBOURS) -> list[int]:
         """Photos of the same spectral band that were compared before, nearest first. If the
-        position is unknown: those that came next before or after it.
+        position is unknown, and where hardly any is near a photo that does not tell where it looks:
+        those that came next before or after it.
         """
         if pose is None:
             return self._latest(member, most)
-        return self._nearest(member, pose)[:most]
+        near = self._nearest(member, pose)[:most]
+        if len(near) < GUESSED and member.prior.sigma_tilt_deg > STATED_DEG:
+            near += [i for i in self._latest(member, GUESSED) if i not in near]
+        return near
 
     def strangers(self, member: Member, pose: Pose, met: Iterable[int] = ()) -> list[int]:
         """The nearest photos, of those like the ones that `of` gives, in other blocks of linked
