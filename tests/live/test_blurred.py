@@ -2,6 +2,7 @@
 
 import io
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import cv2
@@ -162,3 +163,6 @@ def test_the_order_in_which_two_photos_were_linked_does_not_matter(turned):
     blur = LiveBlur(live_links)
     assert blur._lacks(1, 2) == pytest.approx([1.0, 1.0])
     assert blur._lacks(2, 1) == pytest.approx([-1.0, -1.0])
+    for b_S_a, told in ((-1.2, True), (1j, False), (1.5, False)):  # from a side, from farther away
+        live_links.link = lambda *_, s=complex(b_S_a): replace(link, b_S_a=s)
+        assert (LiveBlur(live_links)._lacks(1, 2) is not None) == told

@@ -64,6 +64,14 @@ def test_a_photo_without_prior_is_one_whose_metadata_say_nothing(live):
         )
 
 
+def test_a_photo_that_tells_no_tilt_is_compared_with_those_beside_it_in_time(live):
+    """Where none seems near: taken to look down, photos of an orbit share nothing."""
+    neighbours, known = live.refinement.local_pose.neighbours, live.members.by_id
+    far = replace(known[1].pose, map_C=known[1].pose.map_C + 5000.0)
+    assert sorted(neighbours.of(known[2], far)) == [1, 3]
+    assert neighbours.of(known[4], far) == []
+
+
 def test_heights_that_some_photos_alone_tell_correct_no_others(live, monkeypatch):
     """The height of a photo that tells none is no error of reported heights, and the other way
     round: photos were placed at the take-off's height, or at twice their own.

@@ -12,6 +12,7 @@ from skyquilt.imaging.blank import Blank, whole_picture
 from skyquilt.live.doubled import tell_doubled
 from skyquilt.live.links import LiveLinks
 from skyquilt.live.members import Member
+from skyquilt.model.features import Link
 from skyquilt.model.photo import Photo
 from skyquilt.ortho.sharpness import BLURRED, FEWEST_CELLS, blurred_note
 from skyquilt.outside import whole
@@ -21,6 +22,11 @@ FEWEST_LINKS = 2
 SHARP_SHARE = 0.75
 """Quantile of the linked photos that counts as sharp: one of four is not blurred. Against it, 5 px
 of motion take 1.2 to 1.7 off the logarithm of detail, sharp photos lie up to 0.9 below.
+"""
+MOST_TURNED_DEG, MOST_LARGER = 30.0, 1.3
+"""Angle by which two photos that are compared are turned against one another at most, half a turn
+aside, and how much larger one of them shows the ground at most: detail differs by up to 1.1, by 1.9
+beyond.
 """
 KEY, NOTED = "blurred", "blurred noted"
 """Names in the ledger of the blurred photos, and of how many were noted last."""
@@ -87,7 +93,7 @@ class LiveBlur:
 
     def _compared(self, a: int, b: int) -> NDArray[np.float64] | None:
         link = self.live_links.link(a, b)
-        if link is None:
+        if link is None or not _alike(link):
             return None
         matched = {link.a: link.index_a, link.b: link.index_b}  # a photo that waited is its first
         shown = [self._detail(i, matched[i]) for i in (a, b)]
@@ -100,6 +106,15 @@ class LiveBlur:
         photo, px = self.members.by_id[number].photo, self.live_links.features(number).px[chosen]
         detail = self.live_links.detail(number)
         return np.asarray(detail[_cells(px, photo, detail.shape[:2])][:, :2], np.float64)
+
+
+def _alike(link: Link) -> bool:
+    """Whether two photos show the ground in about the same direction and size: along an axis of the
+    one lies other detail than along that of the other, where they are turned, and it is larger
+    where one looks from farther away, as photos around a place do.
+    """
+    turned = abs((np.degrees(np.angle(link.b_S_a)) + 90) % 180 - 90)
+    return bool(turned <= MOST_TURNED_DEG and abs(np.log(abs(link.b_S_a))) <= np.log(MOST_LARGER))
 
 
 def _cells(
