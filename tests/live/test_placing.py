@@ -109,3 +109,16 @@ def test_heights_above_take_off_that_stay_at_zero_are_not_used(flight, tmp_path)
     assert (first.prior.map_C[2], len(live.members.near)) == (0.0, 6)
     assert last.prior.map_C[2] == pytest.approx(60, abs=3)
     live.close()
+
+
+def test_a_photo_is_refined_by_the_link_for_which_it_is_refined_again(live, monkeypatch):
+    """Else it would be found again and again, by a map that never comes to rest."""
+    refinement, member, seen = live.refinement, live.members.by_id[4], []
+    neighbours = refinement.local_pose.neighbours
+    monkeypatch.setattr(neighbours, "of", lambda *_: [])  # as if the nearest were enough
+    monkeypatch.setattr(refinement, "_pairs", iter([(member, 3)]))
+    monkeypatch.setattr(refinement, "_commit", lambda _, change, __: seen.append(change.links))
+    assert refinement.rejoined() is not None
+    assert live.queues.untried[0] is member
+    refinement.refine(member)
+    assert [link is not None for link in seen[0].values()] == [True] and (3, 4) in seen[0]

@@ -81,14 +81,17 @@ class LocalPose:
         self.adjust_locally = LocalAdjustment()
         self.young = Bundle(per_photo=150, match_observations=None, thorough=False)
 
-    def refine(self, member: Member) -> Change:
-        """Compares a photo with its neighbours and adjusts it together with them; writes
-        nothing.
+    def refine(
+        self, member: Member, more: Mapping[tuple[int, int], Link | None] = MappingProxyType({})
+    ) -> Change:
+        """Compares a photo with its neighbours and adjusts it together with them and with what it
+        was compared with besides (`more`); writes nothing.
 
         Raises:
             UnreadablePhotoError: it has no links, and is black or white all over.
         """
         links = self.live_links.compared(member, self.neighbours.of(member, member.pose))
+        links |= more
         links |= self._strangers(member, member.pose, links)
         good = {key: k for key, k in links.items() if k is not None}
         if not good:

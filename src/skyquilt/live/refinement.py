@@ -18,6 +18,7 @@ from skyquilt.live.members import Member, Queues, about_record
 from skyquilt.live.redraw_queue import RedrawQueue
 from skyquilt.live.thermal_notes import ThermalNotes
 from skyquilt.live.veils import LiveVeils
+from skyquilt.model.features import Link
 from skyquilt.model.poses import Pose
 
 LOOP = 12
@@ -55,6 +56,7 @@ class Refinement:
         self.blur, self.veils = blur, veils
         self.thermal_notes = ThermalNotes(blur.live_links)
         self._pairs = self._apart()
+        self._rejoining: dict[int, dict[tuple[int, int], Link | None]] = {}
         self._tried = max((m.tried for m in self.members.by_id.values()), default=0)
 
     def refine(self, member: Member) -> Update:
@@ -62,7 +64,7 @@ class Refinement:
         if member.state == "superseded":
             self.queues.untried.popleft()
             return Update(what="noted", photo=member.id)
-        change = self.local_pose.refine(member)
+        change = self.local_pose.refine(member, self._rejoining.pop(member.id, {}))
         found = self._found(member, change)
         self._commit(member, change, found)
         if member.id in self.redraw.held:  # it is linked with none: by its metadata then
@@ -272,7 +274,8 @@ class Refinement:
     def rejoined(self) -> Update | None:
         """Compares a photo outside the largest block with one of another block near it, where no
         photos arrive: later photos were compared with those that were nearest only. Where they
-        match, it waits to be refined again. None where there is no such photo.
+        match, it waits to be refined again, by that link, too, or it would be found again and
+        again. None where there is no such photo.
         """
         pair = next(self._pairs, None)
         if pair is None:
@@ -285,6 +288,7 @@ class Refinement:
             else:
                 self.ledger.put_links([(a, b, None) for a, b in links])
         if any(links.values()):
+            self._rejoining[member.id] = links
             self.queues.untried.append(member)
         return Update(what="noted", photo=member.id)
 
