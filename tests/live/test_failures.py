@@ -415,6 +415,22 @@ def test_the_final_map_names_photos_whose_files_are_gone(flight, tmp_path, monke
     live.close()
 
 
+def test_a_folder_of_the_survey_that_is_removed_is_told_on_the_page_too(flight, tmp_path):
+    (tmp_path / "in").mkdir()
+    live = LiveMap(tmp_path / "out", QUICK)
+    shutil.rmtree(live.folder / "photos")
+    shutil.copy(flight.photos[0], tmp_path / "in")
+    stop, events = threading.Event(), []
+    for event in iter_live([tmp_path / "in"], live, stop=stop):
+        events.append(event)
+        stop.set()
+    (note,) = events
+    assert note.warning and "is gone: no photo is accepted until it is back" in note.text
+    told = live.ledger.rows("select body from event where kind = 'note'")
+    assert [json.loads(body)["text"] for (body,) in told] == [note.text]
+    live.close()
+
+
 def test_two_live_maps_on_one_folder_are_refused(tmp_path):
     code = (
         "import sys; from pathlib import Path; from skyquilt.engine.lock import FolderLock;"

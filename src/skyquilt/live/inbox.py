@@ -17,7 +17,7 @@ from pathlib import Path
 
 from skyquilt.errors import OutputError, UnreadablePhotoError
 from skyquilt.live.ledger import Ledger, hit
-from skyquilt.outside import put_in_place
+from skyquilt.outside import is_folder, put_in_place
 from skyquilt.photos.headers import HEAD_BYTES, kind_of
 from skyquilt.video.read import CLIP_ENDINGS
 from skyquilt.video.tracks import TRACK_ENDINGS
@@ -157,5 +157,10 @@ def _refusal(folder: Path, error: OSError) -> OutputError:
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return OutputError(
             f"the disk is full: {folder} cannot take another photo. Make room and send it again"
+        )
+    if not is_folder(folder):
+        return OutputError(
+            f"{folder} is gone: no photo is accepted until it is back. If it was removed, end the"
+            " live map and start it again"
         )
     return OutputError(f"cannot write to {folder}: {error.strerror or error}")

@@ -6,6 +6,7 @@ import sqlite3
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from skyquilt.engine.error_log import NAME as ERRORS
@@ -65,6 +66,8 @@ def iter_live(
         except (OutputError, sqlite3.Error) as error:
             if str(error) != failing:  # once, however long a disk is full
                 failing = str(error)
+                with suppress(OutputError, sqlite3.Error):  # for the page, where there is room
+                    live.ledger.tell("note", {"text": failing})
                 yield Note(text=failing, warning=True)
             stop.wait(FULL_S)
             continue
