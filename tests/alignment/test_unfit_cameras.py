@@ -18,12 +18,13 @@ from skyquilt.alignment.unfit_cameras import (
     cut_cameras,
     cut_notes,
     loosened,
+    other_focals,
     uncentred,
     unfit_cameras,
     unfit_notes,
 )
 from skyquilt.model.camera import Camera
-from skyquilt.model.photo import Shutter
+from skyquilt.model.photo import Focal, Shutter
 from tests.alignment.surveys import FOCAL, HEIGHT, WIDTH, alignment, photo
 from tests.alignment.test_bundle import Flown
 
@@ -161,3 +162,19 @@ def setup_of():
         return set_up(photos, flown.priors, start, distortion="full", repair=True)
 
     return made
+
+
+@pytest.mark.parametrize(
+    ("found", "begun", "again"),
+    [
+        (1400.0, {}, 4.0),  # it tends there, and its prior holds it back
+        (770.0, {}, None),
+        (2800.0, {"cam": 4.0}, None),
+        (3500.0, {"cam": 4.0}, 6.25),
+    ],
+)
+def test_guessed_focal_lengths_begin_again_where_they_tend(found, begun, again):
+    guess = Focal(px=FOCAL, sigma_px=175.0, source="guess")
+    multiples, sure = other_focals(alignment(focal=found), {"cam": guess}, begun)
+    assert multiples == ({} if again is None else {"cam": pytest.approx(again)})
+    assert sure == (again is None)

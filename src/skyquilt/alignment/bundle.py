@@ -37,8 +37,10 @@ from skyquilt.alignment.unfit_cameras import (
     CameraPriors,
     cut_cameras,
     loosened,
+    other_focals,
     uncentred,
     unfit_cameras,
+    with_focals,
 )
 from skyquilt.alignment.upside_down import turned_note, upside_down
 from skyquilt.engine.free_memory import give_back
@@ -79,7 +81,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 60
+    version: ClassVar[int] = 61
 
     def __call__(
         self,
@@ -102,8 +104,9 @@ class Bundle:
             AlignmentError: no two photos are linked.
         """
 
-        def enlarged(begun: Beginning) -> Sequence[Photo]:
-            return as_enlarged(photos, begun.enlarged) if begun.enlarged else photos
+        def taken(begun: Beginning) -> Sequence[Photo]:
+            own = with_focals(photos, begun.focals) if begun.focals else photos
+            return as_enlarged(own, begun.enlarged) if begun.enlarged else own
 
         def adjust(begun: Beginning) -> Alignment:
             upright = [k for k in links if not begun.aside & {k.a, k.b}]
@@ -112,16 +115,18 @@ class Bundle:
                 if len(photos) > self.many
                 else Keep(workers=keep.workers, told=keep.told)
             )
-            own = enlarged(begun)
+            own = taken(begun)
             return self._block(own, frame, begun, features, upright, control, grey, part, make_room)
 
         def guess(tried: Tried) -> Sequence[Prior] | None:
-            own = enlarged(tried.begun)
+            own = taken(tried.begun)
             return guessed_priors(own, tried.begun.priors, features, links, tried.found)
 
         def priors_of(tried: Tried) -> CameraPriors:
-            return priors_by_camera(enlarged(tried.begun), self.distortion)
+            return priors_by_camera(taken(tried.begun), self.distortion)
 
+        untold_lens = (p for p in photos if p.calibration is None and p.shown_lens is None)
+        guesses = {p.camera_key: p.focal for p in untold_lens if p.focal.source == "guess"}
         survey = Survey(
             names=[p.name for p in photos],
             cameras=[p.camera_key for p in photos],
@@ -130,6 +135,7 @@ class Bundle:
             adjust=adjust,
             unfit=lambda t: unfit_cameras(t.found, priors_of(t)),
             cut=lambda t: cut_cameras(t.found, priors_of(t)),
+            focals=lambda t: other_focals(t.found, guesses, t.begun.focals),
             beginnings=lambda t: beginnings(t.found, photos, t.begun.priors),
             guess=guess,
         )
@@ -143,7 +149,7 @@ class Bundle:
             begun = replace(begun, aside=begun.aside | more)
             found = adjust(begun)
             weak = weak_photos(found, begun.priors)
-        own = enlarged(begun)
+        own = taken(begun)
         done = hung(found, weak, own, begun.priors, features, links, begun.aside)
         done = told_besides(done, priors, ground_of(frame))
         return replace(done, notes=(*done.notes, *notes)) if notes else done
@@ -177,7 +183,7 @@ class Bundle:
         if not start.blocks:
             raise AlignmentError(f"none of {len(photos)} photos could be linked to another one")
         said, some = tuple[str, ...](), None
-        if self.repair:
+        if self.repair and not begun.focals:
             photos, start, said = focals_by_heights(photos, priors, start, ground)
         if len(start.placed) > self.many:
             sizes = [(p.width, p.height) for p in photos]

@@ -37,7 +37,13 @@ from skyquilt.alignment.oblique_start import (
     turned_priors,
     untold,
 )
-from skyquilt.alignment.unfit_cameras import cut_notes, fits_as_well, fits_cut, unfit_notes
+from skyquilt.alignment.unfit_cameras import (
+    cut_notes,
+    fits_as_well,
+    fits_cut,
+    focal_notes,
+    unfit_notes,
+)
 from skyquilt.errors import AlignmentError
 from skyquilt.model.poses import Alignment, MapFrame, Prior
 
@@ -55,6 +61,9 @@ BEGUN_AGAIN = 5
 """An oblique survey without camera angles is adjusted again as it was found, so often at most, as
 long as photos come nearer to their positions.
 """
+FOCALS_AGAIN = 6
+"""Guessed focal lengths are guessed again so often at most: each time an adjustment comes nearer.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,6 +78,8 @@ class Beginning:
     """Photos that are not adjusted, but hung on the others afterwards."""
     enlarged: Mapping[int, float] = field(default_factory=dict)
     """Factors of photos that are enlarged against others of their camera."""
+    focals: Mapping[str, float] = field(default_factory=dict)
+    """Factors of guessed focal lengths, by camera."""
     loose: frozenset[str] = frozenset()
     """Cameras whose shutters and aspect ratios pictures alone tell."""
     cut: frozenset[str] = frozenset()
@@ -114,6 +125,8 @@ class Survey:
     """Names of cameras that photos contradict (`unfit_cameras`)."""
     cut: Callable[[Tried], frozenset[str]]
     """Names of those whose photos may have been cut off (`cut_cameras`)."""
+    focals: Callable[[Tried], tuple[Mapping[str, float], bool]]
+    """Factors of guessed focal lengths that may be others (`other_focals`)."""
     beginnings: Callable[[Tried], Beginnings]
     """Where photos begin in space (`oblique_start.beginnings`)."""
     guess: Callable[[Tried], Sequence[Prior] | None]
@@ -149,6 +162,22 @@ def repaired(first: Tried, survey: Survey) -> Tried:
     return first
 
 
+def _guessed_focals(last: Tried, survey: Survey) -> Tried:
+    """Focal lengths that no file tells are guessed again where they tend."""
+    best, notes = last, list[str]()
+    for again in range(FOCALS_AGAIN):
+        multiples, sure = survey.focals(best)
+        if not multiples:
+            break
+        focals = {**best.begun.focals, **multiples}
+        other = survey.tried(best.begun, focals=focals, name=f"focal {again} ")
+        fits = fits_as_well if sure else fits_cut
+        if not fits(other.found, best.found):
+            break
+        best, notes = other, focal_notes(other.found, focals)
+    return replace(best, notes=(*last.notes, *notes))
+
+
 def _false_views(last: Tried, survey: Survey) -> Tried:
     """Photos of an oblique survey that look down, whatever they report, begin so: some programs
     count a gimbal's pitch from straight down, or write one angle into all files.
@@ -162,9 +191,10 @@ def _false_views(last: Tried, survey: Survey) -> Tried:
         return last
     counted = lowered(other.found, priors)
     if counted is not priors and not told_no_tilt(other.found, counted)[1]:
-        return replace(survey.tried(other.begun, priors=counted, name="lowered "), notes=(LOWERED,))
+        notes = (*last.notes, LOWERED)
+        return replace(survey.tried(other.begun, priors=counted, name="lowered "), notes=notes)
     note = LOOK_DOWN.format(sum(map(tilted, priors)), len(priors))
-    return replace(other, notes=(note,))
+    return replace(other, notes=(*last.notes, note))
 
 
 def _as_reported(last: Tried, survey: Survey) -> Tried:
@@ -186,7 +216,7 @@ def _as_reported(last: Tried, survey: Survey) -> Tried:
     before = without_photos(last.found, dict.fromkeys(aside, "hung on the others"))
     as_told = turned_away(other.found, angles) < away and len(other.found.held) >= len(before.held)
     if (as_told or nearer(other.found, before, priors)) and agrees(other.found, before):
-        return other
+        return replace(other, notes=last.notes)
     return last
 
 
@@ -354,6 +384,7 @@ def priors_taken(
 
 
 REPAIRS: tuple[Callable[[Tried, Survey], Tried], ...] = (
+    _guessed_focals,
     _false_views,
     _mirrored_positions,
     _as_reported,

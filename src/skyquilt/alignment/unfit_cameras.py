@@ -1,12 +1,12 @@
-"""Cameras that are not what they are taken for: shutters that expose row by row without a word, and
-pictures that were resized along one side or cut off at one.
+"""Cameras that are not what they are taken for: shutters that expose row by row without a word,
+pictures that were resized along one side or cut off at one, and lenses far from a guess.
 
 Such a camera is adjusted again with a readout time and an aspect ratio, or with a principal point,
 that pictures alone tell. A drone that turns with its lines hardly tells the first two apart, so
 they are loosened together.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +16,8 @@ from skyquilt.alignment.enlarged import fits_better, misfit_px
 from skyquilt.alignment.outcome import ASPECT, NO_FIT
 from skyquilt.alignment.problem import READOUT
 from skyquilt.alignment.setup import SIGMA_ASPECT, Setup
-from skyquilt.model.camera import PARAMETERS
+from skyquilt.model.camera import PARAMETERS, Camera
+from skyquilt.model.photo import Focal, Photo
 from skyquilt.model.poses import Alignment
 
 Floats = NDArray[np.float64]
@@ -44,6 +45,16 @@ ASSUMED_MIDDLE, LOOSE_MIDDLE = 0.009, 0.15
 """Deviations of the principal point as shares of the picture's longer side: one at least as wide is
 assumed, and that of what pictures alone tell.
 """
+
+DOUBTFUL = 0.02
+"""A guessed focal length that a flight leaves as uncertain as this share of it may be another one.
+"""
+FAR, FAR_AGAIN = 1.4, 1.1
+"""Factors by which it must be another one then, where it was guessed first and again: less is
+within what a guess allows, or of no effect.
+"""
+MOST_FAR = 12.0
+"""Factor by which it can be another one."""
 
 
 def unfit_cameras(found: Alignment, priors: CameraPriors) -> frozenset[str]:
@@ -161,3 +172,69 @@ def cut_notes(found: Alignment, cameras: Collection[str]) -> tuple[str, ...]:
             " are better."
         )
     return tuple(notes)
+
+
+def other_focals(
+    found: Alignment, guesses: Mapping[str, Focal], begun: Mapping[str, float]
+) -> tuple[dict[str, float], bool]:
+    """Multiples of guessed focal lengths to begin with instead, of cameras of which an alignment
+    tells in which direction the guess was off, and whether it settles them all.
+
+    `guesses`: of each camera without another focal length; `begun`: the multiples of them that it
+    began with.
+    """
+    out, sure = dict[str, float](), True
+    for key in sorted(guesses.keys() & found.cameras.keys()):
+        camera, guess, before = found.cameras[key], guesses[key], begun.get(key, 1.0)
+        settled = not _open(camera)
+        pulled = _pulled(camera, guess.px * before, guess.sigma_px * before)
+        if settled and not pulled and not _fits_none(found, key):
+            continue
+        towards = camera.focal / (guess.px * before)
+        if max(towards, 1 / towards) <= (FAR_AGAIN if key in begun else FAR):
+            continue
+        further = towards * min(max(towards, 0.5), 2.0)  # what it began with still holds it back
+        if not settled:
+            sure = False
+            if 1 / MOST_FAR < further * before < MOST_FAR:
+                towards = further
+        if 1 / MOST_FAR < towards * before < MOST_FAR:
+            out[key] = towards * before
+    return out, sure
+
+
+def _pulled(camera: Camera, began: float, sigma_px: float) -> bool:
+    """Whether what a focal length began with, and its deviation in px, move that of the adjustment
+    by more than the deviation it has there.
+    """
+    after = camera.sigmas[0] if camera.sigmas else np.inf
+    return bool(abs(camera.focal - began) * after > sigma_px**2)
+
+
+def _open(camera: Camera) -> bool:
+    """Whether an alignment leaves the focal length of a camera uncertain."""
+    return camera.sigmas is None or camera.sigmas[0] > DOUBTFUL * camera.focal
+
+
+def with_focals(photos: Sequence[Photo], multiples: Mapping[str, float]) -> list[Photo]:
+    """The photos, guessed focal lengths of some cameras (names) times a factor."""
+    out = list(photos)
+    for i, photo in enumerate(photos):
+        if (m := multiples.get(photo.camera_key)) is not None:
+            px, sigma = photo.focal.px * m, photo.focal.sigma_px * m
+            out[i] = replace(photo, focal=replace(photo.focal, px=px, sigma_px=sigma))
+    return out
+
+
+def focal_notes(found: Alignment, multiples: Mapping[str, float]) -> list[str]:
+    """What the user is told of each camera."""
+    notes = []
+    for key in sorted(multiples):
+        camera = found.cameras[key]
+        wide = 2 * float(np.degrees(np.arctan(camera.width / 2 / camera.focal)))
+        said = (
+            f"Files do not tell the focal length of {key}, and what is usual does not fit its"
+            f" photos: {camera.focal:.0f} px ({wide:.0f} degrees across) do."
+        )
+        notes.append(said + " State it in --cameras if you know it.")
+    return notes
