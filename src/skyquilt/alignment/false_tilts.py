@@ -7,6 +7,7 @@ several directions tell it from a tilt of the map.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.determined import STATED_DEG
 from skyquilt.alignment.priors import empty_prior
+from skyquilt.alignment.setup import HALF_TURN, TURNED
 from skyquilt.geometry.frames import (
     angles_from_cam_R_map,
     cam_R_map_from_angles,
@@ -37,6 +39,8 @@ NOTE = (
 )
 COMMON_DEG = 1.0
 """Smaller errors that photos of a camera have in common are usual."""
+BY_HEIGHTS_DEG = 1.5
+"""The same where heights of positions must tell them from a tilt of the map."""
 COMMON_DEVIATIONS = 4.0
 """Such an error is larger than this many of its deviations,"""
 COMMON_LEFT = 0.5
@@ -45,7 +49,9 @@ LEAST_SCATTER_DEG = 0.3
 """Tilts that photos report are not better than this, even where they agree by chance."""
 LEAST_INSIDE = 0.5
 """Cosine of the angle between axes told and found, above which they are compared."""
-LEAST_NOISE = 0.3
+LINE_DEG = 60.0
+"""Photos that follow one another in directions less apart belong to a line."""
+LEAST_NOISE = 0.1
 """Heights that photos report are not better than this share of their deviations."""
 ROUNDS = 12
 """Of reweighting,"""
@@ -63,11 +69,17 @@ COMMON_NOTE = (
 Array = NDArray[np.float64]
 
 
+def _sensor(found: Alignment, i: int) -> Array:
+    """(3, 3) rotation of the sensor of a photo, whose file may have been turned upside down."""
+    R = found.poses[i].cam_R_map
+    return HALF_TURN @ R if found.camera_of[i].endswith(TURNED) else R
+
+
 def _told_axis(found: Alignment, prior: Prior, i: int) -> Array:
     """(3,) where a photo tells that it looks, in the frame of the camera found; the heading is the
     one found, since that of files may be wrong by itself.
     """
-    R = found.poses[i].cam_R_map
+    R = _sensor(found, i)
     yaw = angles_from_cam_R_map(R)[0]
     return np.asarray(R @ cam_R_map_from_angles(yaw, prior.pitch_deg, prior.roll_deg)[2])
 
@@ -80,8 +92,8 @@ def common_tilts(
     `cameras`: names by photo, in order of capture.
 
     An error of the gimbal turns with the camera, a tilt of the map does not: both are solved for
-    together. Of photos that are all headed alike, heights tell a tilt of the map, as far as it is
-    not one that may be a drift over the flight.
+    together. Of photos that are all headed alike, heights along lines there and back tell a tilt of
+    the map, which no drift over the flight looks like.
     """
     own = [i for i in _largest(found) if priors[i].sigma_tilt_deg <= STATED_DEG]
     told = {i: _told_axis(found, priors[i], i) for i in own}
@@ -92,19 +104,21 @@ def common_tilts(
         return priors, ()
     camera = np.array([names.index(cameras[i]) for i in own])
     tangents = np.array([told[i][:2] / told[i][2] for i in own])
-    turns = _turns(np.array([found.poses[i].cam_R_map for i in own]), camera)
+    turns = _turns(np.array([_sensor(found, i) for i in own]), camera)
     seen = (turns, tangents, np.radians(LEAST_SCATTER_DEG))
     fit, least_deg = _fitted(seen), COMMON_DEG
-    if any(np.trace(_known(fit, number, least_deg)) < 1.5 for number in range(len(names))):
-        C = np.array([found.poses[i].map_C for i in own])
-        high = np.array([[priors[i].map_C[2]] for i in own]) - C[:, 2:]
-        known = np.isfinite(high[:, 0])
+    C = np.array([found.poses[i].map_C for i in own])
+    high = np.array([priors[i].map_C[2] for i in own]) - C[:, 2]
+    known = np.flatnonzero(np.isfinite(high))
+    settled = all(_settled(fit, number) for number in range(len(names)))
+    if not settled and len(known) >= FEWEST:
         scatter = LEAST_NOISE * float(np.median([priors[i].sigma_C[2] for i in own]))
-        heights = (_heights(C, np.array(own), camera)[known], high[known], scatter)
-        fit, least_deg = _fitted(seen, heights), FALSE_DEG
+        first = 2 * len(names)
+        rows, high = _heights(C[known], high[known], np.array(own)[known], camera[known], first)
+        fit, least_deg = _fitted(seen, (rows, high, scatter)), BY_HEIGHTS_DEG
     said, corrected = [], list(priors)
     for number, name in enumerate(names):
-        x = _known(fit, number, least_deg) @ fit.x[2 * number : 2 * number + 2]
+        x = _known(fit, number, least_deg)
         off = float(np.degrees(np.arctan(np.linalg.norm(x))))
         left = np.degrees(np.median(fit.left[camera == number]))
         if off <= least_deg or left > COMMON_LEFT * off:
@@ -118,14 +132,22 @@ def common_tilts(
     return (corrected if said else priors), tuple(said)
 
 
+def _settled(fit: "_Fit", camera: int) -> bool:
+    """Whether an error of `COMMON_DEG` of a camera would be told from chance."""
+    own = slice(2 * camera, 2 * camera + 2)
+    most = float(np.linalg.eigvalsh(fit.covariance[own, own])[-1])
+    return bool(COMMON_DEVIATIONS * np.sqrt(most) < np.radians(COMMON_DEG))
+
+
 def _known(fit: "_Fit", camera: int, least_deg: float) -> Array:
-    """(2, 2) projection of a camera's error onto the axes along which errors of `least_deg` would
-    be told from chance.
+    """(2,) a camera's error along those axes along which it, or one of `least_deg`, is told from
+    chance.
     """
     own = slice(2 * camera, 2 * camera + 2)
     variance, axes = np.linalg.eigh(fit.covariance[own, own])
-    told = COMMON_DEVIATIONS * np.degrees(np.sqrt(variance)) < least_deg
-    return np.asarray(axes * told @ axes.T)
+    along = axes.T @ fit.x[own]
+    known = COMMON_DEVIATIONS * np.sqrt(variance) < np.maximum(abs(along), np.radians(least_deg))
+    return np.asarray(axes @ (along * known))
 
 
 def _largest(found: Alignment) -> list[int]:
@@ -146,20 +168,44 @@ def _turns(cam_R_map: Array, camera: NDArray[np.int64]) -> Array:
     return rows
 
 
-def _heights(C: Array, order: NDArray[np.int64], camera: NDArray[np.int64]) -> Array:
+def _heights(
+    C: Array, high: Array, order: NDArray[np.int64], camera: NDArray[np.int64], first: int
+) -> tuple[Array, Array]:
     """(n, 1, l) by how many m heights told are above those found per unit of the unknowns of
-    `_turns`, and then per m of an offset and a drift of each camera.
+    `_turns`, of which those of the map begin at `first`, and then per m of each camera's drift over
+    the flight; and (n, 1) by how many they are, of `high` (n,). Both from the mean of each line:
+    whatever a drift does from line to line, only what turns with lines there and back counts.
     """
-    cameras = camera.max() + 1
-    first = 2 * cameras + 2
-    rows, each = np.zeros((len(C), 1, first + 2 * cameras)), np.arange(len(C))
-    place = C - C.mean(0)
-    rows[:, 0, first - 2] = -place[:, 1]
-    rows[:, 0, first - 1] = place[:, 0]
-    rows[each, 0, first + 2 * camera] = 1.0
-    late = np.interp(order, [order.min(), max(order.max(), order.min() + 1)], [-1.0, 1.0])
-    rows[each, 0, first + 2 * camera + 1] = late
-    return rows
+    rows, each = np.zeros((len(C), first + 2 + first // 2)), np.arange(len(C))
+    rows[:, first] = -C[:, 1]
+    rows[:, first + 1] = C[:, 0]
+    rows[each, first + 2 + camera] = (order - order.min()) / max(np.ptp(order), 1)
+    line = _lines(C, camera)
+    count = np.bincount(line)
+    for values in (rows.T, high[None]):
+        for own in values:
+            own -= (np.bincount(line, own) / count)[line]
+    return rows[:, None], high[:, None]
+
+
+def _lines(C: Array, camera: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(n,) the number of the straight line that each photo belongs to, of centres (n, 3) in order
+    of capture.
+    """
+    line, number = np.zeros(len(C), np.int64), 0
+    for own in (np.flatnonzero(camera == k) for k in range(camera.max() + 1)):
+        ahead = None
+        line[own[:1]] = number
+        for before, i in pairwise(own):
+            step = C[i, :2] - C[before, :2]
+            length = np.linalg.norm(step) + 1e-9
+            if ahead is not None and ahead @ step < np.cos(np.radians(LINE_DEG)) * length:
+                number, ahead = number + 1, None
+            else:
+                ahead = step / length
+            line[i] = number
+        number += 1
+    return line
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

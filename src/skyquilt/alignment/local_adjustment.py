@@ -16,7 +16,7 @@ from skyquilt.alignment.adjust import adjust
 from skyquilt.alignment.motion import velocities
 from skyquilt.alignment.oblique import told_tilt
 from skyquilt.alignment.problem import Problem, State, residuals_px
-from skyquilt.alignment.setup import HALF_TURN, Setup, pose_records, set_up
+from skyquilt.alignment.setup import HALF_TURN, TURNED, Setup, pose_records, set_up
 from skyquilt.alignment.similarity_graph import fit_similarity
 from skyquilt.alignment.stages import prune
 from skyquilt.alignment.start import Start
@@ -40,8 +40,6 @@ UNEVEN = 0.02
 """Deviation of what links show from level ground, as a share of the flying height."""
 MOST_WEIGHT = 300.0
 """Matches of a link beyond so many do not make it count more."""
-TURNED = "/turned"
-"""Suffix of the names of calibrations for files that were saved upside down."""
 
 
 Array = NDArray[np.float64]

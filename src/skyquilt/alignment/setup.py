@@ -24,6 +24,8 @@ LEAST_FALL = np.sin(np.radians(10.0))
 TOLD_APART = np.sin(np.radians(3.0))
 """Rays that differ by less than about this angle do not tell where they meet."""
 HALF_TURN = np.diag([-1.0, -1.0, 1.0])
+TURNED = "/turned"
+"""Suffix of the names of calibrations for files that were saved upside down."""
 INDEPENDENT = 40
 """Independent observations that tell as much as a photo's many correlated ones."""
 SIGMA_ASPECT = 3e-3
@@ -412,7 +414,7 @@ def camera_records(
     camera_of = {}
     for m in setup.members.tolist():
         key = photos[m].camera_key
-        camera_of[m] = f"{key}/turned" if setup.turned[m] else key
+        camera_of[m] = key + TURNED if setup.turned[m] else key
         if setup.turned[m]:
             cameras.setdefault(camera_of[m], cameras[key].mirrored())
     return cameras, camera_of

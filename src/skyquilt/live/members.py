@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from pyproj import Transformer
 
-from skyquilt.alignment.local_adjustment import TURNED
 from skyquilt.alignment.priors import empty_prior, photo_prior
+from skyquilt.alignment.setup import TURNED
 from skyquilt.live.doubled import Grounded, tell_doubled
 from skyquilt.live.failures import concerning
 from skyquilt.live.inbox import Inbox
