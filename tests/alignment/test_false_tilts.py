@@ -7,11 +7,12 @@ import pytest
 
 from skyquilt.alignment import repairs
 from skyquilt.alignment.false_tilts import common_tilts, told_no_tilt
+from skyquilt.alignment.setup import HALF_TURN, TURNED
 from skyquilt.geometry.frames import cam_R_map_from_angles, rotation_from_vector
 from skyquilt.model.poses import Pose
 from tests.alignment.surveys import prior
 from tests.alignment.test_bundle import Flown
-from tests.alignment.test_oblique import block, hills
+from tests.alignment.test_oblique import CAMERA, block, hills
 
 
 def off(found, flown):
@@ -136,3 +137,18 @@ def test_a_gimbal_that_tells_too_much_does_not_tilt_the_map():
     flown.priors = [replace(p, pitch_deg=p.pitch_deg + 6.0) for p in flown.priors]
     found = flown.aligned()
     assert np.median(off(found, flown)) < 0.3
+
+
+def test_files_that_were_turned_count_by_their_sensors():
+    """By their files, all are headed alike, and the error is seen in two directions."""
+    found, told = lines((20, 200, 20), ahead_deg=-2.0, map_deg=3.0)
+    turned = range(8, 16)
+    poses = found.poses | {
+        i: replace(found.poses[i], cam_R_map=HALF_TURN @ found.poses[i].cam_R_map) for i in turned
+    }
+    names = found.camera_of | dict.fromkeys(turned, f"c{TURNED}")
+    found = replace(
+        found, poses=poses, camera_of=names, cameras=found.cameras | {f"c{TURNED}": CAMERA}
+    )
+    (note,) = common_tilts(found, told, ["c"] * len(told))[1]
+    assert "look 1.9 degrees aside" in note or "look 2." in note

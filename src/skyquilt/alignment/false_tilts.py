@@ -37,10 +37,9 @@ NOTE = (
     " {0:.0f} degrees away from where they say (a camera that is fixed to its aircraft?). They were"
     " not used."
 )
-COMMON_DEG = 1.0
-"""Smaller errors that photos of a camera have in common are usual."""
-BY_HEIGHTS_DEG = 1.5
-"""The same where heights of positions must tell them from a tilt of the map."""
+COMMON_DEG = 1.5
+"""Smaller errors that photos of a camera have in common are usual: lines there and back bear them.
+"""
 COMMON_DEVIATIONS = 4.0
 """Such an error is larger than this many of its deviations,"""
 COMMON_LEFT = 0.5
@@ -106,7 +105,7 @@ def common_tilts(
     tangents = np.array([told[i][:2] / told[i][2] for i in own])
     turns = _turns(np.array([_sensor(found, i) for i in own]), camera)
     seen = (turns, tangents, np.radians(LEAST_SCATTER_DEG))
-    fit, least_deg = _fitted(seen), COMMON_DEG
+    fit = _fitted(seen)
     C = np.array([found.poses[i].map_C for i in own])
     high = np.array([priors[i].map_C[2] for i in own]) - C[:, 2]
     known = np.flatnonzero(np.isfinite(high))
@@ -115,13 +114,13 @@ def common_tilts(
         scatter = LEAST_NOISE * float(np.median([priors[i].sigma_C[2] for i in own]))
         first = 2 * len(names)
         rows, high = _heights(C[known], high[known], np.array(own)[known], camera[known], first)
-        fit, least_deg = _fitted(seen, (rows, high, scatter)), BY_HEIGHTS_DEG
+        fit = _fitted(seen, (rows, high, scatter))
     said, corrected = [], list(priors)
     for number, name in enumerate(names):
-        x = _known(fit, number, least_deg)
+        x = _known(fit, number)
         off = float(np.degrees(np.arctan(np.linalg.norm(x))))
         left = np.degrees(np.median(fit.left[camera == number]))
-        if off <= least_deg or left > COMMON_LEFT * off:
+        if off <= COMMON_DEG or left > COMMON_LEFT * off:
             continue
         axis = np.array([-x[1], x[0], 0.0])
         back = rotation_from_vector(axis / np.linalg.norm(axis) * np.radians(off))
@@ -139,14 +138,14 @@ def _settled(fit: "_Fit", camera: int) -> bool:
     return bool(COMMON_DEVIATIONS * np.sqrt(most) < np.radians(COMMON_DEG))
 
 
-def _known(fit: "_Fit", camera: int, least_deg: float) -> Array:
-    """(2,) a camera's error along those axes along which it, or one of `least_deg`, is told from
+def _known(fit: "_Fit", camera: int) -> Array:
+    """(2,) a camera's error along those axes along which it, or one of `COMMON_DEG`, is told from
     chance.
     """
     own = slice(2 * camera, 2 * camera + 2)
     variance, axes = np.linalg.eigh(fit.covariance[own, own])
     along = axes.T @ fit.x[own]
-    known = COMMON_DEVIATIONS * np.sqrt(variance) < np.maximum(abs(along), np.radians(least_deg))
+    known = COMMON_DEVIATIONS * np.sqrt(variance) < np.maximum(abs(along), np.radians(COMMON_DEG))
     return np.asarray(axes @ (along * known))
 
 
