@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skyquilt.alignment import oblique_start
+from skyquilt.alignment import oblique_start, repairs
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.oblique_guess import LOWERED, guessed_priors, lowered, misled
 from skyquilt.alignment.oblique_start import (
@@ -20,7 +20,7 @@ from skyquilt.alignment.oblique_start import (
 )
 from skyquilt.alignment.triangulate import regular
 from skyquilt.geometry.camera import project
-from skyquilt.geometry.frames import cam_R_map_from_angles
+from skyquilt.geometry.frames import cam_R_map_from_angles, rotation_from_vector
 from skyquilt.matching.verify import Verify
 from skyquilt.model.camera import Camera
 from skyquilt.model.features import Features, Link, Matches
@@ -193,6 +193,59 @@ def test_photos_without_angles_among_those_that_look_aslant_hang_on_them(pitch):
     assert len(found.held) == len(flown.photos)
     away = [np.linalg.norm(found.poses[i].map_C - t.map_C) for i, t in enumerate(flown.truth)]
     assert max(away) < 3.5
+
+
+def test_photos_that_stay_turned_are_hung_on_the_others():
+    """Where neither links nor positions hold them, single ones end in false minima: 19 degrees and
+    13 m aside, of a flight without positions.
+    """
+    flown = Slanting(there_and_back(15), alike_deg=180)
+    found = flown.aligned()
+    aside = rotation_from_vector(np.array([0.2, 0.0, 0.0]))
+
+    def turned(photos):
+        poses = {
+            i: replace(p, cam_R_map=aside @ p.cam_R_map) if i in photos else p
+            for i, p in found.poses.items()
+        }
+        return replace(found, poses=poses)
+
+    asked = []
+
+    def adjust(begun):
+        asked.append(begun)
+        return turned({3}) if len(asked) == 1 else found
+
+    survey = repairs.Survey(
+        names=[p.name for p in flown.photos],
+        cameras=["cam"] * len(flown.photos),
+        speeds=None,
+        linked=len(flown.photos),
+        adjust=adjust,
+        unfit=None,
+        cut=None,
+        focals=None,
+        beginnings=lambda tried: oblique_start.NO_BEGINNINGS,
+        guess=None,
+    )
+    last = repairs.Tried(found=turned({1, 3, 5}), begun=repairs.Beginning(priors=flown.priors))
+    as_reported = next(r for r in repairs.REPAIRS if r.__name__ == "_as_reported")
+    assert as_reported(last, survey).found is found
+    assert [(b.name, b.aside) for b in asked] == [
+        ("as reported ", frozenset()),
+        ("without turned ", frozenset({3})),
+    ]
+
+
+def test_photos_without_positions_begin_where_they_were_found():
+    flown = Slanting(there_and_back(15), alike_deg=180)
+    found = flown.aligned()
+    nowhere = [replace(p, map_C=np.full(3, np.nan)) for p in flown.priors]
+    assert oblique_start.aslant(nowhere)
+    begin = oblique_start.beginnings(found, flown.photos, nowhere)
+    assert begin.centres.keys() == set(found.held)
+    for i, centre in begin.centres.items():
+        np.testing.assert_array_equal(centre, found.poses[i].map_C)
 
 
 def swaying(seed, off=0.0, without=()):

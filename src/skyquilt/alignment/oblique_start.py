@@ -95,10 +95,11 @@ def beginnings(found: Alignment, photos: Sequence[Photo], priors: Sequence[Prior
     C = np.array([found.poses[i].map_C for i in held]).reshape(-1, 3)
     apart = np.array([priors[i].map_C for i in held]).reshape(-1, 3) - C
     for i in found.held:
-        if held and not told(priors[i]) and tells_angles(priors[i]):
-            here = found.poses[i].map_C
-            near = np.argsort(np.linalg.norm(C - here, axis=1))[:NEIGHBOURS]
-            centres[i] = here + apart[near].mean(0)
+        if not told(priors[i]) and tells_angles(priors[i]):
+            centres[i] = here = found.poses[i].map_C
+            if held:
+                near = np.argsort(np.linalg.norm(C - here, axis=1))[:NEIGHBOURS]
+                centres[i] = here + apart[near].mean(0)
     return Beginnings(centres=centres, yaw_deg=yaw_deg)
 
 
@@ -108,10 +109,10 @@ def slanting(priors: Sequence[Prior]) -> bool:
 
 
 def aslant(priors: Sequence[Prior]) -> bool:
-    """Whether most photos tell their whole pose, and look aslant, though the survey is no oblique
+    """Whether most photos tell where they look, and look aslant, though the survey is no oblique
     one.
     """
-    known = [cam_R_map_from_angles(0.0, p.pitch_deg, p.roll_deg) for p in priors if told(p)]
+    known = [cam_R_map_from_angles(0.0, p.pitch_deg, p.roll_deg) for p in priors if tells_angles(p)]
     half = len(known) > len(priors) / 2
     return half and not slanting(priors) and np.median([*map(tilt_deg, known)]) > ASLANT_DEG
 

@@ -55,6 +55,10 @@ AWAY = 0.85
 """Photos that tell their poses, and lie further from their positions than this times their
 deviations in space (median; two thirds are usual), may have been begun wrongly.
 """
+FEW_TURNED = 0.2
+"""Photos that stay turned from what they report are hung on the others, if they are no more than
+this share.
+"""
 MORE_ALIKE = 0.8
 """Photos that look nearer to where they say by this factor are told better."""
 BEGUN_AGAIN = 5
@@ -201,7 +205,7 @@ def _as_reported(last: Tried, survey: Survey) -> Tried:
     """Photos that look somewhat aslant begin as they report: links of these, taken for similarities
     of the ground's plane, may put them where positions look like gross errors, contradict one
     another, or turn them far from their angles. Photos that do not report their angles are hung on
-    the others.
+    the others, and so are a few that stay turned: alone in a false minimum.
     """
     priors = last.begun.priors
     if not aslant(priors):
@@ -214,15 +218,18 @@ def _as_reported(last: Tried, survey: Survey) -> Tried:
     aside = last.begun.aside | (untold(priors) - begin.centres.keys())
     other = survey.tried(last.begun, in_space=begin, aside=aside, name="as reported ")
     before = without_photos(last.found, dict.fromkeys(aside, "hung on the others"))
-    as_told = turned_away(other.found, angles) < away and len(other.found.held) >= len(before.held)
-    if (as_told or nearer(other.found, before, priors)) and agrees(other.found, before):
-        return replace(other, notes=last.notes)
-    return last
+    left = turned_away(other.found, angles)
+    as_told = len(left) < len(away) and len(other.found.held) >= len(before.held)
+    if not (as_told or nearer(other.found, before, priors)) or not agrees(other.found, before):
+        return last
+    if 0 < len(left) <= FEW_TURNED * len(other.found.held):
+        other = survey.tried(other.begun, aside=aside | left, name="without turned ")
+    return replace(other, notes=last.notes)
 
 
-def turned_away(found: Alignment, priors: Sequence[Prior]) -> int:
-    """How many photos of an adjustment look elsewhere than they report, further than these err."""
-    return sum(turned_deg(found.poses[i], priors[i]) > STATED_DEG for i in found.held)
+def turned_away(found: Alignment, priors: Sequence[Prior]) -> frozenset[int]:
+    """The photos of an adjustment that look elsewhere than they report, further than these err."""
+    return frozenset(i for i in found.held if turned_deg(found.poses[i], priors[i]) > STATED_DEG)
 
 
 def _enlargements(last: Tried, survey: Survey) -> Tried:
