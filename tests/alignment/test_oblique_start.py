@@ -336,7 +336,8 @@ def test_what_is_an_oblique_survey():
     assert aslant([some] * 6 + [level] * 5)
     assert not aslant([some] * 5 + [level] * 6)
     assert not aslant([tilted] * 11)  # the survey itself is oblique
-    assert not aslant([some] * 5 + [prior((np.nan,) * 3, pitch=20)] * 6)
+    assert aslant([some] * 5 + [prior((np.nan,) * 3, pitch=20)] * 6)
+    assert not aslant([some] * 5 + [replace(some, sigma_tilt_deg=6.0)] * 6)  # they do not tell
     flown = Slanting(orbit(12, 50))
     assert reported_start(flown.photos, flown.priors, flown.features, ()) is None
 
