@@ -30,7 +30,7 @@ from skyquilt.alignment.stages import (
     settled,
     weighed,
 )
-from skyquilt.alignment.start import Start, find_start, focals_by_heights, ground_of
+from skyquilt.alignment.start import Start, find_start, focals_by_heights, ground_of, with_focals
 from skyquilt.alignment.tracks import Thinning, Tracks, build_tracks, thin
 from skyquilt.alignment.triangulate import triangulated
 from skyquilt.alignment.unfit_cameras import (
@@ -40,7 +40,6 @@ from skyquilt.alignment.unfit_cameras import (
     other_focals,
     uncentred,
     unfit_cameras,
-    with_focals,
 )
 from skyquilt.alignment.upside_down import turned_note, upside_down
 from skyquilt.engine.free_memory import give_back
@@ -125,8 +124,7 @@ class Bundle:
         def priors_of(tried: Tried) -> CameraPriors:
             return priors_by_camera(taken(tried.begun), self.distortion)
 
-        untold_lens = (p for p in photos if p.calibration is None and p.shown_lens is None)
-        guesses = {p.camera_key: p.focal for p in untold_lens if p.focal.source == "guess"}
+        guesses = {p.camera_key: p.focal for p in photos if p.lens_guessed}
         survey = Survey(
             names=[p.name for p in photos],
             cameras=[p.camera_key for p in photos],

@@ -232,8 +232,6 @@ def _fitted(*groups: tuple[Array, Array, float]) -> _Fit:
         own = [rows @ x[: rows.shape[2]] for rows, _, _ in groups]
         left = [np.linalg.norm(g[1] - o, axis=1) for g, o in zip(groups, own, strict=True)]
         for (rows, observed, least), away in zip(groups, left, strict=True):
-            if not len(rows):
-                continue
             scatter = max(float(np.median(away)) / MEDIAN_LENGTH[observed.shape[1]], least)
             far = (away / (CUT * scatter)) ** 2 if again else np.zeros(len(away))
             weight, known = scatter**-2 / (1 + far), slice(rows.shape[2])

@@ -164,8 +164,7 @@ def focals_by_heights(
             continue
         for i in block:
             own, height = photos[i], priors[i].map_C[2] - ground_m
-            bare = own.calibration is None and own.shown_lens is None
-            if bare and own.focal.source == "guess" and height > LEAST_FOCAL_M:
+            if own.lens_guessed and height > LEAST_FOCAL_M:
                 sized.setdefault(own.camera_key, []).append(height / abs(start.placed[i][0]))
     factors: dict[str, float] = {}
     for camera, found in sized.items():
@@ -175,20 +174,28 @@ def focals_by_heights(
             factors[camera] = factor
     if not factors:
         return photos, start, ()
-    told, said = list(photos), []
-    placed = dict(start.placed)
+    told = with_focals(photos, factors, FOCAL_SHARE)
+    placed = {
+        i: (a * factors.get(photos[i].camera_key, 1.0), t) for i, (a, t) in start.placed.items()
+    }
+    px = {p.camera_key: p.focal.px for p in told}
+    said = tuple(FOCAL_NOTE.format(camera, px[camera]) for camera in factors)
+    return told, replace(start, placed=placed), said
+
+
+def with_focals(
+    photos: Sequence[Photo], factors: Mapping[str, float], share: float | None = None
+) -> list[Photo]:
+    """The photos, focal lengths of some cameras (names) times a factor, with a deviation of this
+    share of them; None: of the share that they had.
+    """
+    out = list(photos)
     for i, photo in enumerate(photos):
-        factor = factors.get(photo.camera_key, 1.0)
-        if factor == 1.0:
-            continue
-        px = photo.focal.px * factor
-        told[i] = replace(photo, focal=replace(photo.focal, px=px, sigma_px=FOCAL_SHARE * px))
-        if i in placed:
-            placed[i] = (placed[i][0] * factor, placed[i][1])
-    for camera in factors:
-        px = next(p.focal.px for p in told if p.camera_key == camera)
-        said.append(FOCAL_NOTE.format(camera, px))
-    return told, replace(start, placed=placed), tuple(said)
+        if (factor := factors.get(photo.camera_key)) is not None:
+            px = photo.focal.px * factor
+            sigma = photo.focal.sigma_px * factor if share is None else share * px
+            out[i] = replace(photo, focal=replace(photo.focal, px=px, sigma_px=sigma))
+    return out
 
 
 def _scaled(block: Sequence[int], priors: Sequence[Prior], start: Start) -> bool:

@@ -6,7 +6,7 @@ that pictures alone tell. A drone that turns with its lines hardly tells the fir
 they are loosened together.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +17,7 @@ from skyquilt.alignment.outcome import ASPECT, NO_FIT
 from skyquilt.alignment.problem import READOUT
 from skyquilt.alignment.setup import SIGMA_ASPECT, Setup
 from skyquilt.model.camera import PARAMETERS, Camera
-from skyquilt.model.photo import Focal, Photo
+from skyquilt.model.photo import Focal
 from skyquilt.model.poses import Alignment
 
 Floats = NDArray[np.float64]
@@ -214,16 +214,6 @@ def _pulled(camera: Camera, began: float, sigma_px: float) -> bool:
 def _open(camera: Camera) -> bool:
     """Whether an alignment leaves the focal length of a camera uncertain."""
     return camera.sigmas is None or camera.sigmas[0] > DOUBTFUL * camera.focal
-
-
-def with_focals(photos: Sequence[Photo], multiples: Mapping[str, float]) -> list[Photo]:
-    """The photos, guessed focal lengths of some cameras (names) times a factor."""
-    out = list(photos)
-    for i, photo in enumerate(photos):
-        if (m := multiples.get(photo.camera_key)) is not None:
-            px, sigma = photo.focal.px * m, photo.focal.sigma_px * m
-            out[i] = replace(photo, focal=replace(photo.focal, px=px, sigma_px=sigma))
-    return out
 
 
 def focal_notes(found: Alignment, multiples: Mapping[str, float]) -> list[str]:

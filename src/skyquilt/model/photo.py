@@ -239,6 +239,12 @@ class Photo:
         return "-".join(part for part in (self.digest, self.stored, faults) if part)
 
     @property
+    def lens_guessed(self) -> bool:
+        """Whether nothing tells the lens, so that its focal length is a guess."""
+        told = self.calibration is not None or self.shown_lens is not None
+        return not told and self.focal.source == "guess"
+
+    @property
     def shows_a_band(self) -> bool:
         """Whether the file shows one band of a multispectral camera."""
         return bool(self.band_name) and self.channels == 1
