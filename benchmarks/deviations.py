@@ -29,9 +29,11 @@ from tests.alignment.test_bundle import FRAME, Flown  # noqa: E402
 
 from skyquilt.alignment.bundle import Bundle  # noqa: E402
 from skyquilt.alignment.control import MARKED_PX, Control  # noqa: E402
+from skyquilt.alignment.false_tilts import turned_prior  # noqa: E402
 from skyquilt.alignment.problem import READOUT  # noqa: E402
 from skyquilt.engine.clock import Clock, result_of  # noqa: E402
 from skyquilt.engine.store import Store  # noqa: E402
+from skyquilt.geometry.frames import rotation_from_vector  # noqa: E402
 from skyquilt.model.camera import PARAMETERS, Camera  # noqa: E402
 from skyquilt.model.poses import Alignment  # noqa: E402
 from skyquilt.settings import MosaicSettings  # noqa: E402
@@ -60,14 +62,19 @@ TILT_DEG, YAW_DEG = 0.5, 3.0
 
 
 class Drawn(Flown):
-    """A flight whose lens and angles err by the deviations that are stated for them."""
+    """A flight whose lens and angles err by the deviations that are stated for them; tilts each for
+    itself, and all alike.
+    """
 
     def __init__(self, seed: int, noise: float, **options) -> None:
         free = np.array([1, 1, 1, 1, 1, 1, 1, 1, 1, 0, 0], bool)
         options = {"sigma_k": SIGMA_K, "free": free, "lens": LENS, **options}
         super().__init__(seed, noise=noise, tilt_deg=TILT_DEG, yaw_deg=YAW_DEG, **options)
+        alike = np.radians(np.random.default_rng([seed, 9]).normal(0, TILT_DEG, 2))
+        gimbal = rotation_from_vector(np.array([[*alike, 0.0]]))[0]
         self.priors = [
-            replace(p, sigma_tilt_deg=TILT_DEG, sigma_yaw_deg=YAW_DEG) for p in self.priors
+            replace(p, sigma_tilt_deg=TILT_DEG, sigma_yaw_deg=YAW_DEG)
+            for p in (turned_prior(p, gimbal) for p in self.priors)
         ]
         names = dict(zip(PARAMETERS, LENS[:READOUT].tolist(), strict=True))
         told = Camera(width=800, height=600, sigmas=tuple(SIGMA_K[:READOUT].tolist()), **names)

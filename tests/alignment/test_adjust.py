@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from skyquilt.alignment import equations
-from skyquilt.alignment.adjust import adjust, covariance
+from skyquilt.alignment.adjust import adjust, covariance, with_common_tilts
 from skyquilt.alignment.eliminated_points import observation_equations, points_step, polish_points
 from skyquilt.alignment.equations import Equations
 from skyquilt.alignment.outcome import leave_one_out
@@ -17,6 +17,7 @@ from skyquilt.alignment.robust import prior_terms, robust_cost
 from skyquilt.alignment.stages import prune
 from skyquilt.geometry import block_cholesky
 from skyquilt.geometry.block_cholesky import Factor
+from skyquilt.geometry.frames import rotation_from_vector
 from tests.alignment.blocks import (
     FREE,
     dense_covariance,
@@ -240,6 +241,28 @@ def test_an_undetermined_system_has_no_covariance():
     )
     with np.errstate(invalid="ignore"):
         assert covariance(nothing, block.start) is None
+
+
+def test_an_error_that_all_tilts_share_moves_the_block_as_its_covariance_says():
+    """A strip of two cameras, with a lens that is adjusted: the same adjustment with one camera's
+    measured attitudes turned by one deviation about the same axis of their own.
+    """
+    block = make_block(11, lines=1, per_line=8, cameras=2)
+    problem, turned = block.problem, (block.problem.camera == 1)[:, None, None]
+    first = adjust(problem, block.start, tolerance=1e-12).state
+    alone = covariance(problem, first)
+    told = with_common_tilts(alone, problem, first)
+    for axis, by in enumerate(rotation_from_vector(np.radians(1.0) * np.eye(3)[:2])):
+        R0 = np.where(turned, by @ problem.R0, problem.R0)
+        moved = adjust(replace(problem, R0=R0), first, tolerance=1e-12).state
+        photos, lens = np.split(told.common[:, 2 + axis], [6 * len(first.C)])
+        assert pytest.approx(photos.reshape(-1, 6)[:, 3:], abs=0.012) == moved.C - first.C
+        said = lens.reshape(-1, CAMERA) / problem.sigma_K
+        assert pytest.approx(said, abs=0.01) == (moved.K - first.K) / problem.sigma_K
+    assert np.abs(told.common[: 6 * len(first.C)].reshape(-1, 6, 4)[:, 3:]).max() > 0.4
+    both = np.sqrt(np.diagonal(told.of([0, 7]))[[3, 4, 5, 9, 10, 11]].reshape(2, 3))
+    assert pytest.approx(both) == told.photo_sigmas[[0, 7]]
+    assert (told.photo_sigmas > alone.photo_sigmas).all()
 
 
 # what it finds

@@ -8,14 +8,14 @@ pycolmap's Ceres on problems that both can express.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.equations import Equations, NearFactor
 from skyquilt.alignment.problem import CAMERA, Problem, State
-from skyquilt.alignment.robust import robust_cost
+from skyquilt.alignment.robust import attitude_terms, robust_cost
 from skyquilt.engine.free_memory import give_back
 from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.engine.workers import HERE
@@ -51,24 +51,35 @@ class Covariance:
 
     photos: Array
     """(n, p, p) of each photo with itself: rotation in rad, centre in m, and turn in rad if p is
-    9.
+    9; without `common`, as all fields before that.
     """
     cameras: Array
-    """(10m, 10m); zero for what is fixed."""
+    """(11m, 11m); zero for what is fixed."""
     inverse: Matrix
     """Of all pairs of photos that share a point, and of photos with cameras."""
     factor: Factor
     """Gives it for other pairs."""
+    common: Array
+    """(total, k) by how much k errors of one deviation each move all unknowns, that measurements
+    have in common and the equations know nothing of.
+    """
 
     @property
     def camera_sigmas(self) -> Array:
         """Standard deviations (m, 11) of the cameras' unknowns."""
-        return np.asarray(np.sqrt(np.abs(np.diagonal(self.cameras))).reshape(-1, CAMERA))
+        variance = np.abs(np.diagonal(self.cameras)).copy()
+        pat = self.inverse.pattern
+        lens = self.common[pat.count * pat.size :][: len(variance)]  # none where all are fixed
+        variance[: len(lens)] += (lens**2).sum(1)
+        return np.asarray(np.sqrt(variance).reshape(-1, CAMERA))
 
     @property
     def photo_sigmas(self) -> Array:
         """Standard deviations (n, 3) of the centres in m."""
-        return np.sqrt(np.abs(np.diagonal(self.photos, axis1=1, axis2=2)[:, 3:6]))
+        pat = self.inverse.pattern
+        moved = self.common[: pat.count * pat.size].reshape(pat.count, pat.size, -1)[:, 3:6]
+        alone = np.abs(np.diagonal(self.photos, axis1=1, axis2=2)[:, 3:6])
+        return np.asarray(np.sqrt(alone + (moved**2).sum(2)))
 
     def of(self, photos: Sequence[int] | Index) -> Array:
         """(p k + b, p k + b) of some photos and the border of the system: all cameras with free
@@ -79,17 +90,18 @@ class Covariance:
         a, b = np.minimum.outer(chosen, chosen), np.maximum.outer(chosen, chosen)
         pair = pat.find(a.ravel(), b.ravel()).reshape(k, k)
         border = pat.count * p + np.arange(pat.border)
+        rows = np.concatenate([(chosen[:, None] * p + np.arange(p)).ravel(), border])
+        alike = self.common[rows] @ self.common[rows].T
         if (pair < 0).any():
-            rows = np.concatenate([(chosen[:, None] * p + np.arange(p)).ravel(), border])
             unit = np.zeros((self.factor.total, len(rows)))
             unit[rows, np.arange(len(rows))] = 1.0
-            return np.asarray(self.factor.solve(unit)[rows])
+            return np.asarray(self.factor.solve(unit)[rows] + alike)
         blocks = self.inverse.blocks[pair]
         turned = chosen[:, None] > chosen
         blocks[turned] = np.swapaxes(blocks[turned], 1, 2)
         beside = self.inverse.beside[chosen].reshape(k * p, pat.border)
         own = np.swapaxes(blocks, 1, 2).reshape(k * p, k * p)
-        return np.block([[own, beside], [beside.T, self.inverse.corner]])
+        return np.asarray(np.block([[own, beside], [beside.T, self.inverse.corner]]) + alike)
 
 
 def adjust(
@@ -175,4 +187,20 @@ def covariance(problem: Problem, state: State) -> Covariance | None:
     photos = inverse.blocks[system.pattern.find(own, own)]
     if not (np.isfinite(photos).all() and np.isfinite(cameras).all()):
         return None
-    return Covariance(photos=photos, cameras=cameras, inverse=inverse, factor=factor)
+    none = np.zeros((factor.total, 0))
+    return Covariance(photos=photos, cameras=cameras, inverse=inverse, factor=factor, common=none)
+
+
+def with_common_tilts(found: Covariance, problem: Problem, state: State) -> Covariance:
+    """The covariance where tilts that were measured err by their deviations not only each by itself
+    but also all of a camera alike, as seen from it, as a gimbal does. No number of photos averages
+    that out.
+    """
+    first = problem.photo_unknowns * np.arange(len(state.C))
+    tilt = np.where(np.isfinite(problem.sigma_R), problem.sigma_R, 0.0)[:, :1]
+    known = attitude_terms(problem, state)[1] * tilt
+    pull = np.zeros((found.factor.total, 2 * len(state.K)))
+    for axis in range(2):  # an error about x, and one about y of a camera
+        turned = np.einsum("nij,nj->ni", problem.R0, known * problem.R0[:, axis])
+        pull[first[:, None] + np.arange(3), 2 * problem.camera[:, None] + axis] = turned
+    return replace(found, common=found.factor.solve(pull))

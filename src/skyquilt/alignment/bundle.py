@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from skyquilt.alignment.adjust import covariance
+from skyquilt.alignment.adjust import covariance, with_common_tilts
 from skyquilt.alignment.control import Control, hold_to_control, residuals_of_control
 from skyquilt.alignment.determined import weak_photos
 from skyquilt.alignment.dominant_plane import levelled
@@ -80,7 +80,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 63
+    version: ClassVar[int] = 64
 
     def __call__(
         self,
@@ -342,7 +342,8 @@ def _outcome(
     weak = {int(i): f"it has only {seen[i]} tie points" for i in setup.members if seen[i] < 8}
     if all(c.check for c in control):
         weak |= _nowhere(start)
-    full = covariance(problem, state)
+    alone = covariance(problem, state)
+    full = alone and with_common_tilts(alone, problem, state)
     cameras, camera_of = camera_records(
         photos, setup, state, None if full is None else full.camera_sigmas
     )
@@ -365,5 +366,5 @@ def _outcome(
         if predicted and full and len(ties.px)
         else None,
         notes=undetermined(setup, problem, state, full) + misfits(setup, problem, state),
-        loo_rms_m=leave_one_out(problem, state, full) if setup.georeferenced else None,
+        loo_rms_m=leave_one_out(problem, state, alone) if setup.georeferenced else None,
     )

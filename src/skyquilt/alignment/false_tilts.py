@@ -126,7 +126,7 @@ def common_tilts(
         back = rotation_from_vector(axis / np.linalg.norm(axis) * np.radians(off))
         for i, prior in enumerate(priors):
             if cameras[i] == name and prior.sigma_tilt_deg <= STATED_DEG:
-                corrected[i] = _turned(prior, back)
+                corrected[i] = turned_prior(prior, back)
         said.append(COMMON_NOTE.format(name, off))
     return (corrected if said else priors), tuple(said)
 
@@ -242,8 +242,8 @@ def _fitted(*groups: tuple[Array, Array, float]) -> _Fit:
     return _Fit(x=x, covariance=few * np.linalg.inv(N), left=left[0])
 
 
-def _turned(prior: Prior, back: Array) -> Prior:
-    """A prior whose camera is turned in its own frame."""
+def turned_prior(prior: Prior, back: Array) -> Prior:
+    """A prior whose camera is turned (3, 3) in its own frame."""
     heading = prior.yaw_deg if np.isfinite(prior.yaw_deg) else 0.0
     R = back @ cam_R_map_from_angles(heading, prior.pitch_deg, prior.roll_deg)
     yaw, pitch, roll = angles_from_cam_R_map(R)

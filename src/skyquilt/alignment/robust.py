@@ -59,9 +59,7 @@ class PriorTerms:
 def prior_terms(problem: Problem, state: State) -> PriorTerms:
     """The priors on photos and cameras at a state."""
     dc, pc, cost_c = position_terms(problem, state)
-    rotation = attitude_error(state.R, problem.R0)
-    wr, cost_r = _pseudo_huber(((rotation / problem.sigma_R) ** 2).sum(1), problem.loss_R)
-    pr = wr[:, None] / problem.sigma_R**2  # about the map's axes
+    rotation, pr, cost_r = attitude_terms(problem, state)
     pk, dk = problem.free / problem.sigma_K**2, state.K - problem.K0
     pt = np.zeros_like(state.turn)
     if problem.sigma_turn is not None:
@@ -85,6 +83,15 @@ def point_terms(problem: Problem, state: State) -> tuple[Array, Array]:
     """Precisions (P, 3) of the priors on points, and misfits (P, 3) in m."""
     precision = np.where(np.isfinite(problem.X0), 1 / problem.sigma_X**2, 0.0)
     return precision, np.nan_to_num(state.X - problem.X0)
+
+
+def attitude_terms(problem: Problem, state: State) -> tuple[Array, Array, Array]:
+    """Misfits (n, 3) in rad of the measured attitudes about the map's axes, their precisions (n, 3)
+    and costs (n,).
+    """
+    rotation = attitude_error(state.R, problem.R0)
+    weight, cost = _pseudo_huber(((rotation / problem.sigma_R) ** 2).sum(1), problem.loss_R)
+    return rotation, weight[:, None] / problem.sigma_R**2, cost
 
 
 def position_terms(problem: Problem, state: State) -> tuple[Array, Array, Array]:
