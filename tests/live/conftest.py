@@ -119,7 +119,7 @@ class Served:
             "/photos", params={"name": name or path.name}, content=path.read_bytes(), **more
         )
 
-    def until(self, holds: Callable[[], bool], seconds: float = 60.0) -> None:
+    def until(self, holds: Callable[[], bool], seconds: float = 300.0) -> None:
         """Waits."""
         for _ in range(int(seconds / 0.05)):
             if holds():

@@ -46,7 +46,7 @@ def shot(page, name):
         page.screenshot(path=str(Path(SHOTS) / f"{name}.png"))
 
 
-def holds(page, expression, seconds=30):
+def holds(page, expression, seconds=120):
     """Waits until an expression is true; the page's own policy forbids Playwright's way of
     waiting.
     """

@@ -38,7 +38,7 @@ def impatient(monkeypatch):
     monkeypatch.setattr(folder_watch, "PATIENCE_S", 0.5)
 
 
-def taken(out, inbox, photos, seconds=60):
+def taken(out, inbox, photos, seconds=300):
     """Runs live on a folder until so many photos are placed or refused and nothing is left to draw;
     the map stays open.
     """
@@ -293,7 +293,7 @@ def test_an_inbox_that_the_system_does_not_answer_for_is_waited_for(tmp_path, mo
     assert len(box.look(2.5, photos=1)) == 1
 
 
-def run_until(live, inbox, done, seconds=60, stop=None):
+def run_until(live, inbox, done, seconds=300, stop=None):
     """Notes of a live map that runs until `done()` after something happened, or until `stop`."""
     stop = stop or threading.Event()
     timer = threading.Timer(seconds, stop.set)

@@ -16,7 +16,7 @@ from skyquilt.server.access import Guard
 from skyquilt.server.server_process import ServerConfig, ServerProcess
 
 
-def until(holds, seconds=30.0):
+def until(holds, seconds=300.0):
     end = time.monotonic() + seconds
     while not holds():
         assert time.monotonic() < end, "it did not happen in time"

@@ -24,7 +24,7 @@ def site(tmp_path_factory):
         yield site
 
 
-def photos(site, start, seconds=30):
+def photos(site, start, seconds=120):
     """Names of the photos that begin so, when there are no more of them."""
     until, last = time.monotonic() + seconds, -1
     while time.monotonic() < until:
@@ -49,7 +49,7 @@ def test_a_video_in_one_request_and_its_telemetry(site, film):
     found = photos(site, "A.MP4.")
     assert len(found) > 3
     assert {p["source"] for p in found} == {"mini"}
-    assert site.web.get(f"/photos/{found[0]['id']}").json()["at"] is not None
+    site.until(lambda: site.web.get(f"/photos/{found[0]['id']}").json()["at"] is not None)
     assert list((site.folder / "clips" / "waiting").iterdir()) == []
     assert list((site.folder / "uploads").glob("*.part")) == []
 

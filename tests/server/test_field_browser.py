@@ -66,7 +66,7 @@ def opens(browser):
         context.close()
 
 
-def holds(page, expression, seconds=20):
+def holds(page, expression, seconds=120):
     for _ in range(seconds * 20):
         if page.evaluate(expression):
             return

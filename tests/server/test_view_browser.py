@@ -60,7 +60,7 @@ def opened(browser, site, look="light"):
     return page
 
 
-def holds(page, expression, seconds=40):
+def holds(page, expression, seconds=120):
     for _ in range(seconds * 10):
         if page.evaluate(expression):
             return
