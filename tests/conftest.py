@@ -4,6 +4,7 @@ import gc
 import json
 import pickle
 import shutil
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -71,6 +72,21 @@ def finished(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished
     # a copy: some tests lay something beside the map for a moment
     output = shutil.copytree(folder / "out", tmp_path_factory.mktemp("finished") / "out")
     return Finished(output=output, events=pickle.loads((folder / "events").read_bytes()))
+
+
+BEGAN_S = time.monotonic()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """`--within`, for CI: on a slow machine it leaves out what is last instead of taking an hour."""
+    parser.addoption("--within", type=float, metavar="S", help="skip slow tests that begin later")
+
+
+@pytest.hookimpl(tryfirst=True)  # before the test's fixtures are made
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    most = item.config.getoption("--within")
+    if most is not None and time.monotonic() - BEGAN_S > most and item.get_closest_marker("slow"):
+        pytest.skip(f"the {most:.0f} s for slow tests are over (`make test-all` has no limit)")
 
 
 LONG = ("test_large_survey", "test_windows", "test_docs")
