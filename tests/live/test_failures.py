@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from itertools import count
 from pathlib import Path
 
@@ -428,6 +429,31 @@ def test_a_folder_of_the_survey_that_is_removed_is_told_on_the_page_too(flight, 
     assert note.warning and "is gone: no photo is accepted until it is back" in note.text
     told = live.ledger.rows("select body from event where kind = 'note'")
     assert [json.loads(body)["text"] for (body,) in told] == [note.text]
+    live.close()
+
+
+@pytest.mark.parametrize("what", ["removed", "replaced", "back in time"])
+def test_a_survey_that_is_removed_while_it_grows_ends_it(tmp_path, monkeypatch, what):
+    """It had gone on for ever, with a page of what is gone. Where another survey took its place,
+    photos were accepted by a database without a name, and lost.
+    """
+    monkeypatch.setattr(workflow, "GONE_S", 0.2)
+    monkeypatch.setattr(workflow, "IDLE_S", 0.0)
+    live = LiveMap(tmp_path / "out", QUICK)
+    stopped, until = threading.Event(), time.monotonic() + 0.5
+    events = iter_live([], live, stop=stopped)
+    live.folder.rename(tmp_path / "away")
+    if what == "back in time":
+        (tmp_path / "away").rename(live.folder)
+    elif what == "replaced":
+        live.folder.mkdir()
+        Ledger(live.folder, write=True).close()
+    monkeypatch.setattr(live, "work", lambda: stopped.set() if time.monotonic() > until else None)
+    if what == "back in time":
+        assert list(events) == []
+    else:
+        with pytest.raises(OutputError, match="was removed or replaced while the map grew there"):
+            list(events)
     live.close()
 
 

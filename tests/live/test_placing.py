@@ -9,6 +9,7 @@ import pytest
 
 from skyquilt.alignment.priors import photo_prior
 from skyquilt.errors import AlignmentError
+from skyquilt.geometry.frames import cam_R_map_from_angles
 from skyquilt.live.live_map import LiveMap
 from skyquilt.live.members import Member
 from skyquilt.live.settings import LiveSettings
@@ -118,7 +119,37 @@ def test_a_photo_is_refined_by_the_link_for_which_it_is_refined_again(live, monk
     monkeypatch.setattr(neighbours, "of", lambda *_: [])  # as if the nearest were enough
     monkeypatch.setattr(refinement, "_pairs", iter([(member, 3)]))
     monkeypatch.setattr(refinement, "_commit", lambda _, change, __: seen.append(change.links))
-    assert refinement.rejoined() is not None
+    with monkeypatch.context() as apart:
+        apart.setattr(live.members, "block", lambda i: {i})  # as if of two blocks
+        assert refinement.rejoined() is not None
     assert live.queues.untried[0] is member
     refinement.refine(member)
     assert [link is not None for link in seen[0].values()] == [True] and (3, 4) in seen[0]
+
+
+def test_a_photo_that_looks_aside_and_tells_no_tilt_is_held_by_those_around_it(live, monkeypatch):
+    """It was linked with five that seem near, by where it would look if it looked down: a block of
+    photos that look 40 degrees to a side was found 70 degrees off.
+    """
+    refinement, known = live.refinement, live.members.by_id
+    for a, b in live.ledger.rows("select a, b from link where a = 4 or b = 4"):
+        if (a, b) != (3, 4):  # as if enough others had been found before
+            live.ledger.rows("delete from link where a = ? and b = ?", a, b)
+            known[a].links.discard(b)
+            known[b].links.discard(a)
+    member, before = known[4], live.schedule.since
+    assert list(refinement._apart()) == []
+    told = member.prior
+    monkeypatch.setattr(member, "prior", replace(told, sigma_tilt_deg=6.0))
+    assert list(refinement._apart()) == []  # it looks down
+    aside = cam_R_map_from_angles(told.yaw_deg, 0.0, 40.0)
+    monkeypatch.setattr(member, "pose", replace(member.pose, cam_R_map=aside))
+    refinement._pairs = refinement._apart()
+    while refinement.rejoined() is not None:
+        pass
+    linked = {
+        a for a, b in live.ledger.rows("select a, b from link where body is not null and b = 4")
+    }
+    assert linked == member.links == {1, 2, 3}
+    assert live.schedule.since == before + 2  # the block is adjusted anew,
+    assert not live.queues.untried  # and no photo by itself

@@ -72,7 +72,13 @@ def test_a_file_that_stays_torn_is_refused_and_taken_when_it_is_whole(watched, f
     assert "truncated" in done[0].reason
     assert watched.look(0.5) == []  # said once
     path.write_bytes(data)
+    assert watched.ledger.counts() == {"refused": 1}
+    path.with_name("other.jpg").write_bytes(data[:9000])
+    watched.look(0.8)
+    path.write_bytes(data)
     assert [type(d) for d in watched.look(0.4)] == [Accepted]
+    # what was refused before is no photo that the map lacks
+    assert watched.ledger.rows("select name from refused") == [("other.jpg",)]
 
 
 def test_a_file_must_be_quiet_where_the_system_does_not_tell(tmp_path, flight, monkeypatch):

@@ -37,6 +37,10 @@ def test_what_fails_once_is_read_again(page, flight, tmp_path):  # noqa: F811
         holds(page, "skyquilt.plan.marks.size == 7", 5)
         holds(page, "skyquilt.state.overlays.size == 1 && skyquilt.state.refused.length == 1", 5)
         holds(page, "document.getElementById('link').textContent == 'live' && missed.size == 0", 5)
+        for k, name in enumerate(("other.jpg", "odd.jpg")):  # what was refused comes whole
+            web.post("/photos", params={"name": name}, content=flight.photos[k].read_bytes())
+            holds(page, f"skyquilt.state.photos.size == {k + 1}", 5)
+            assert page.evaluate("skyquilt.state.refused.length") == 1 - k
         assert not page.errors
 
 

@@ -2,7 +2,7 @@
 
 Those of a camera fixed to its aircraft, whose files say that it looked straight down, are not used.
 Those of a gimbal with an error that all its photos have in common are corrected: photos headed in
-several directions tell it from a tilt of the map.
+several directions tell it from a tilt of the map, or heights that rise on each line anew.
 """
 
 from collections.abc import Sequence
@@ -48,6 +48,10 @@ LEAST_SCATTER_DEG = 0.3
 """Tilts that photos report are not better than this, even where they agree by chance."""
 LEAST_INSIDE = 0.5
 """Cosine of the angle between axes told and found, above which they are compared."""
+LEAN_DEG = 5.0
+"""Less than so much may be what a drift that goes on in the turns between lines does."""
+LEAST_ON_LINE, LEAST_LINES = 3, 2
+"""Photos on a line, and lines, whose heights tell a gimbal from a drift."""
 LINE_DEG = 60.0
 """Photos that follow one another in directions less apart belong to a line."""
 LEAST_NOISE = 0.1
@@ -129,6 +133,59 @@ def common_tilts(
                 corrected[i] = turned_prior(prior, back)
         said.append(COMMON_NOTE.format(name, off))
     return (corrected if said else priors), tuple(said)
+
+
+def leaning_lines(
+    found: Alignment, priors: Sequence[Prior], cameras: Sequence[str]
+) -> tuple[Sequence[Prior], tuple[str, ...]]:
+    """As `common_tilts`, of oblique photos on lines whose pictures do not hold on to one another,
+    as those that look ahead there and back: each line then leans by what its gimbal is off, and
+    agrees with what it tells. Heights found rise to where the photos look, on each line anew, which
+    no drift over the flight does.
+    """
+    said, corrected = list[str](), list(priors)
+    stated = [
+        i
+        for i in _largest(found)
+        if priors[i].sigma_tilt_deg <= STATED_DEG and np.isfinite(priors[i].map_C[2])
+    ]
+    for name in dict.fromkeys(cameras[i] for i in stated):
+        own = [i for i in stated if cameras[i] == name]
+        rise = _rise(found, priors, own) if len(own) >= FEWEST else 0.0
+        beside = [priors[i].pitch_deg - angles_from_cam_R_map(_sensor(found, i))[1] for i in own]
+        off = float(np.degrees(np.arctan(rise)) + np.median(beside))
+        if rise == 0.0 or abs(off) <= LEAN_DEG:
+            continue
+        for i, prior in enumerate(priors):
+            if cameras[i] == name and prior.sigma_tilt_deg <= STATED_DEG:
+                corrected[i] = replace(prior, pitch_deg=prior.pitch_deg - off)
+        said.append(COMMON_NOTE.format(name, abs(off)))
+    return (corrected if said else priors), tuple(said)
+
+
+def _rise(found: Alignment, priors: Sequence[Prior], own: Sequence[int]) -> float:
+    """By how much heights found rise beside those told, m per m along the headings of photos on
+    each line, of two lines and more; 0 where chance and a drift over the flight tell it, too.
+    """
+    C = np.array([found.poses[i].map_C for i in own])
+    high = np.array([C[k, 2] - priors[i].map_C[2] for k, i in enumerate(own)])
+    yaw = np.radians([angles_from_cam_R_map(_sensor(found, i))[0] for i in own])
+    line = _lines(C, np.zeros(len(own), np.int64))
+    count = np.bincount(line)
+    if (count >= LEAST_ON_LINE).sum() < LEAST_LINES:
+        return 0.0
+    middle = np.stack([np.bincount(line, v) / count for v in C.T[:2]], axis=1)[line]
+    ahead = ((C[:, :2] - middle) * np.stack([np.sin(yaw), np.cos(yaw)], axis=1)).sum(1)
+    least = LEAST_NOISE * float(np.median([priors[i].sigma_C[2] for i in own]))
+    one, when = np.ones(len(own)), np.linspace(-1, 1, len(own))
+    leaning, drifting = (
+        _fitted((np.stack(rows, axis=1)[:, None], high[:, None], least))
+        for rows in ([one, when, ahead], [one, when])
+    )
+    rise, sigma = float(leaning.x[2]), float(np.sqrt(leaning.covariance[2, 2]))
+    left, without = (float(np.median(fit.left)) for fit in (leaning, drifting))
+    told = abs(rise) > COMMON_DEVIATIONS * sigma and left < COMMON_LEFT * without
+    return rise if told else 0.0
 
 
 def _settled(fit: "_Fit", camera: int) -> bool:

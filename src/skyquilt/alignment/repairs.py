@@ -12,7 +12,7 @@ from skyquilt.alignment.crowded_positions import believed
 from skyquilt.alignment.determined import STATED_DEG
 from skyquilt.alignment.displaced_parts import as_taken, brought_together
 from skyquilt.alignment.enlarged import enlarged_note, enlarged_photos, fits_better
-from skyquilt.alignment.false_tilts import common_tilts, off_told, told_no_tilt
+from skyquilt.alignment.false_tilts import common_tilts, leaning_lines, off_told, told_no_tilt
 from skyquilt.alignment.late_positions import as_moved, mirrored, moved_note, on_time, unshifted
 from skyquilt.alignment.motion import Speeds
 from skyquilt.alignment.oblique import reported_oblique, tilted, turned_deg, without_photos
@@ -295,6 +295,15 @@ def _common_tilts(last: Tried, survey: Survey) -> Tried:
     return last
 
 
+def _leaning_lines(last: Tried, survey: Survey) -> Tried:
+    """Oblique photos whose lines lean as their gimbal is off are corrected by that."""
+    priors = last.begun.priors
+    if not (slanting(priors) or aslant(priors)):
+        return last
+    corrected, notes = leaning_lines(last.found, priors, survey.cameras)
+    return _if_nearer(last, survey, corrected, "leaning ", *notes) if notes else last
+
+
 def _false_tilts(last: Tried, survey: Survey) -> Tried:
     """Tilts that pictures contradict as a whole are not used."""
     if slanting(last.begun.priors):
@@ -367,11 +376,13 @@ def _freed(
     return replace(other, notes=(*last.notes, *notes(other.found, cameras)))
 
 
-def _if_nearer(last: Tried, survey: Survey, priors: Sequence[Prior], name: str, note: str) -> Tried:
+def _if_nearer(
+    last: Tried, survey: Survey, priors: Sequence[Prior], name: str, *notes: str
+) -> Tried:
     """The adjustment with other priors, where photos come nearer to their positions with these."""
     other = survey.tried(last.begun, priors=priors, name=name)
     if off_positions(other.found, priors) < off_positions(last.found, priors):
-        return replace(other, notes=(*last.notes, note))
+        return replace(other, notes=(*last.notes, *notes))
     return last
 
 
@@ -398,6 +409,7 @@ REPAIRS: tuple[Callable[[Tried, Survey], Tried], ...] = (
     _enlargements,
     _cut_pictures,
     _late_positions,
+    _leaning_lines,
     _late_moments,
     _common_tilts,
     _false_tilts,

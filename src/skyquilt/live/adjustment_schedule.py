@@ -213,4 +213,5 @@ class Blocks:
             store=self.store,
             methods=self.methods,
             sweep=sweep,
+            most_view_deg=self.settings.max_view_angle,
         )

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.local_adjustment import AdjustedWindow, LocalAdjustment, Window
+from skyquilt.alignment.oblique_start import tilt_warnings
 from skyquilt.engine.background import Background
 from skyquilt.engine.clock import result_of
 from skyquilt.engine.store import Store
@@ -73,6 +74,8 @@ class AdjustmentJob:
     """Whether ground heights are also computed from the images by plane sweep, as in the batch
     workflow.
     """
+    most_view_deg: float = 90.0
+    """Angle from the nadir up to which photos are drawn."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -162,7 +165,7 @@ def _whole(
         camera_of={job.ids[k]: done.camera_of[k] for k in done.poses},
         xyz=xyz,
         rejected={job.ids[k]: why for k, why in done.rejected.items()},
-        notes=done.notes,
+        notes=(*done.notes, *tilt_warnings(job.priors, done, job.most_view_deg)),
     )
 
 

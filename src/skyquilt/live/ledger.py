@@ -121,6 +121,15 @@ def _rolled_back(db: sqlite3.Connection) -> None:
         db.execute("rollback")
 
 
+def _identity(path: Path) -> tuple[int, int] | None:
+    """What tells a file from others that bear its name later; None where there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
+
+
 class Ledger:
     """The database of one live survey. Can be shared between threads."""
 
@@ -133,6 +142,7 @@ class Ledger:
         self.path = Path(folder) / NAME
         self.lock = threading.RLock()
         self.db = open_database(self.path, TABLES, write=write)
+        self._opened = _identity(self.path)
         try:
             self._check()
             found = self.meta("format", FORMAT if write else None)
@@ -164,6 +174,12 @@ class Ledger:
         for key in ("settings", "schedule"):
             if not isinstance(self.meta(key, {}), dict):
                 raise self.damaged(f"{key} is no record")
+
+    @property
+    def in_place(self) -> bool | None:
+        """Whether the file is still the one that was opened; None where there is none."""
+        now = _identity(self.path)
+        return None if now is None else now == self._opened
 
     def damaged(self, why: str) -> OutputError:
         """The error that ends what uses this survey."""
@@ -269,6 +285,11 @@ class Ledger:
                 (name, source, reason, time.time()),
             )
             self.tell("refused", {"name": name, "source": source, "reason": reason})
+
+    def taken_after_all(self, name: str, source: str) -> None:
+        """Forgets that a file was refused: one of its name came whole from the same drone."""
+        with self.change() as db:
+            db.execute("delete from refused where name = ? and source = ?", (name, source))
 
     def forget_refused(self, digest: str) -> None:
         """Forgets a photo that is refused, and whose file was gone until it arrived again, so that

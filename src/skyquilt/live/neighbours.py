@@ -17,6 +17,10 @@ from skyquilt.model.poses import Pose
 
 STRANGERS = 2
 """Photos of blocks that a photo is not linked with, with which it is compared besides."""
+BESIDE = 12
+"""Photos around one that looks aside and does not tell where, with which it is compared: as many as
+on the map at the end.
+"""
 CELL_M = 30.0
 """Side of the cells of the index in m."""
 GUESSED = 2
@@ -83,6 +87,21 @@ class Neighbours:
             and not self.members.ledger.compared(i, member.id)
         )
         return list(islice(others, STRANGERS))
+
+    def beside(self, member: Member) -> list[int]:
+        """The photos of its band taken nearest to one, by their places on the map, those left out
+        with which it was compared. Where each looks is no matter: it may be found wrongly.
+        """
+        if member.pose is None:
+            return []
+        C = member.pose.map_C[:2]
+        apart = sorted(
+            (float(np.hypot(*(m.pose.map_C[:2] - C))), m.id)
+            for m in self.members.on_map()
+            if m.pose is not None and m.id != member.id and m.photo.band == member.photo.band
+        )
+        known = self.members.ledger.compared
+        return [i for _, i in apart[:BESIDE] if not known(i, member.id)]
 
     def _nearest(self, member: Member, pose: Pose) -> list[int]:
         """The photos that may show the same as one at this pose, nearest first."""

@@ -206,6 +206,7 @@ class Intake:
             number = int(cursor.lastrowid or 0)
             if photo.in_colours or photo.shows_a_band:
                 db.execute("insert into band values (?, ?)", (number, _band(photo)))
+            self.ledger.taken_after_all(name, source)
             said = {"id": number, "name": name, "source": source, "state": "received"}
             self.ledger.tell("photo", said | ({"state": "kept", "reason": kept} if kept else {}))
         hit("photo row committed")

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.determined import STATED_DEG
-from skyquilt.alignment.oblique import FAR_OFF, turned_deg
+from skyquilt.alignment.oblique import FAR_OFF, tilt_deg, turned_deg
 from skyquilt.geometry.neighbours import nearest
 from skyquilt.live.adjustment_schedule import Schedule
 from skyquilt.live.blur import LiveBlur
@@ -16,6 +16,7 @@ from skyquilt.live.links import link_bytes
 from skyquilt.live.local_pose import Change, LocalPose
 from skyquilt.live.members import Member, Queues, about_record
 from skyquilt.live.redraw_queue import RedrawQueue
+from skyquilt.live.settings import CLOSING
 from skyquilt.live.thermal_notes import ThermalNotes
 from skyquilt.live.veils import LiveVeils
 from skyquilt.model.features import Link
@@ -27,6 +28,8 @@ MOST_ASIDE, LEAST_BELOW, MOST_BELOW = 4.0, 0.1, 5.0
 """Ground lies this far beside the nearest photo at most, and this far below it at least and at
 most, all in flying heights.
 """
+ASIDE_DEG = 15.0
+"""Tilt of a photo that looks aside: the photos nearest to one are not those that show the same."""
 MOST_COMPARED = 24
 """Number of others with which a photo was compared, from which it is taken to match none."""
 LOST = 2
@@ -275,13 +278,17 @@ class Refinement:
         """Compares a photo outside the largest block with one of another block near it, where no
         photos arrive: later photos were compared with those that were nearest only. Where they
         match, it waits to be refined again, by that link, too, or it would be found again and
-        again. None where there is no such photo.
+        again. So is one that looks aside and does not tell where with those around it: the block is
+        adjusted anew with such links. None where there is no such photo.
         """
         pair = next(self._pairs, None)
         if pair is None:
             return None
         member, other = pair
         links = self.local_pose.live_links.compared(member, [other])
+        if other in self.members.block(member.id):
+            self._held_firmer(member, links)
+            return Update(what="noted", photo=member.id)
         with self.ledger.change():
             if any(links.values()):
                 self._again(member)
@@ -292,10 +299,35 @@ class Refinement:
             self.queues.untried.append(member)
         return Update(what="noted", photo=member.id)
 
+    def _held_firmer(self, member: Member, links: dict[tuple[int, int], Link | None]) -> None:
+        """Stores further links of a photo within its block, which is then adjusted anew."""
+        with self.ledger.change():
+            self.ledger.put_links(
+                [(a, b, None if k is None else link_bytes(k)) for (a, b), k in links.items()]
+            )
+            for a, b in (key for key, k in links.items() if k is not None):
+                self.members.joined(a, b)
+                self.schedule.refined(member.id, loop=False)
+            self.schedule.write(self.ledger)
+
     def _apart(self) -> Iterator[tuple[Member, int]]:
         """Photos on the map outside its largest block, each with one of another block near it with
-        which it was not compared; to the end as long as no photo moves.
+        which it was not compared, and those that look aside and do not tell where, with ones beside
+        them; to the end as long as no photo moves.
         """
+        yield from self._others_near()
+        if not self.local_pose.settings.reposition:
+            return
+        for member in list(self.members.on_map()):
+            aside = member.state == "refined" and member.prior.sigma_tilt_deg > STATED_DEG
+            if not aside or member.pose is None or tilt_deg(member.pose.cam_R_map) < ASIDE_DEG:
+                continue
+            if len(self.members.block(member.id)) <= CLOSING:
+                for i in self.local_pose.neighbours.beside(member):
+                    yield member, i
+
+    def _others_near(self) -> Iterator[tuple[Member, int]]:
+        """The former of `_apart`."""
         more = True
         while more:
             more = False

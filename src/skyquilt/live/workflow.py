@@ -32,6 +32,8 @@ without a photo.
 """
 FULL_S = 2.0
 """Pause in s when the disk is full."""
+GONE_S = 10.0
+"""The map ends where the survey's folder has been gone for this time in s."""
 STEADY_S = 5.0
 """With `finish`: if no photo arrives for this time in s, the flight is over."""
 
@@ -50,7 +52,7 @@ def iter_live(
     what is missing when the flight has ended. Every pause and refusal is reported.
 
     Raises:
-        UsageError: a folder is missing.
+        UsageError: a folder is missing. OutputError: the survey's folder was removed or replaced.
     """
     stop = stop or threading.Event()
     watches: list[Watch | UploadedClips] = [Watch(folder=f, intake=live.intake) for f in folders]
@@ -58,7 +60,9 @@ def iter_live(
     busy_since = time.monotonic()
     filled = not fill
     away, failing = set[Path](), ""
+    there = time.monotonic()
     while not stop.is_set():
+        there = _still_there(live, there)
         try:
             yield from _away(folders, away, live.ledger)
             yield from _taken(watches)
@@ -88,6 +92,22 @@ def iter_live(
         if live.ledger.meta("finish") == "asked" and not growing:
             yield from _finished(live, live.settings)
         stop.wait(IDLE_S)
+
+
+def _still_there(live: LiveMap, since: float) -> float:
+    """When the survey's folder was seen last, in monotonic seconds; `since`: before now.
+
+    Raises:
+        OutputError: it has been gone for long, or is another one: what is written to the files that
+            are open would be lost.
+    """
+    now, known = time.monotonic(), live.ledger.in_place
+    if known is False or (known is None and now - since > GONE_S):
+        raise OutputError(
+            f"{live.folder} was removed or replaced while the map grew there, and what it held is"
+            " gone; the same command begins again, with the photos that are in their folders"
+        )
+    return now if known else since
 
 
 def _away(folders: Sequence[Path], away: set[Path], ledger: Ledger) -> Iterator[Event]:

@@ -83,6 +83,7 @@ const told = (kind, use) => (e) => { heard = Date.now(); state.last = Math.max(s
 const photoNews = (p) => {
   if (state.meanwhile) state.meanwhile.push(p);
   const known = state.photos.get(p.id) || {}, { time, ...rest } = p;
+  if (!state.photos.has(p.id)) state.refused = (state.refused || []).filter((r) => r.name !== p.name || r.source !== p.source);  // it came whole after all
   state.photos.set(p.id, { received: Date.now() / 1000, ...known, ...(p.state !== known.state ? { reason: "" } : {}), ...rest, time: known.time || (time ? Date.parse(/[zZ]|[+-]\d\d:?\d\d$/.test(time) ? time : `${time}Z`) / 1000 : null) });
   listSoon(); readInfoSoon();
 };
