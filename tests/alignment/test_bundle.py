@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pyproj import Transformer
 
-from skyquilt.alignment.aligners import blank_notes, choose_method
+from skyquilt.alignment.aligners import blank_notes, choose_method, placed
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.control import Control, control_in_frame, fit_similarity_3d
 from skyquilt.alignment.deviations import drift, position_noise
@@ -551,6 +551,34 @@ def test_photos_that_show_nothing_are_told(blank, told):
     notes = blank_notes([found(0)] * blank + [found(300)] * (4 - blank))
     assert bool(notes) == told
     assert not told or notes[0].startswith(f"{blank} of 4 photos show next to nothing")
+
+
+@pytest.mark.slow
+def test_positions_that_most_contradict_do_not_move_the_map():
+    """A third of the photos is of a drone with a false base; before, all of them moved and turned
+    the map.
+    """
+    flown = Flown()
+    away = set(range(1, len(flown.priors), 3))
+    shift = np.array([70.0, 70.0, 0.0])
+    told = [replace(p, map_C=p.map_C + shift * (i in away)) for i, p in enumerate(flown.priors)]
+    found = Bundle()(flown.photos, FRAME, told, flown.features, flown.links)
+    off = np.array([found.poses[i].map_C - flown.truth.C[i] for i in sorted(found.poses)])
+    assert np.abs(off[:, :2]).max() < 2.0
+    assert any(f"positions of {len(away)} of {len(told)} photos" in note for note in found.notes)
+
+
+def test_copies_of_one_picture_are_refused_with_the_reason():
+    """No point that they share has a place, so none of them has a pose, and no misfit is told."""
+    flown = Flown()
+    one, all_of_it = flown.features[0], np.arange(len(flown.features[0].px))
+    bare = [replace(p, map_C=np.full(3, np.nan), yaw_deg=np.nan) for p in flown.priors[:3]]
+    whole = Matches(index_a=all_of_it, index_b=all_of_it)
+    links = [Verify()(a, b, one, one, whole, WIDTH) for a, b in ((0, 1), (0, 2), (1, 2))]
+    found = Bundle(match_observations=None)(flown.photos[:3], LOCAL, bare, [one] * 3, links)
+    assert not found.poses
+    with pytest.raises(AlignmentError, match="none of 3 photos could be placed .* copies"):
+        placed(found)
 
 
 @pytest.mark.parametrize(

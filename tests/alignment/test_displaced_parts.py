@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skyquilt.alignment.displaced_parts import as_taken, brought_together
+from skyquilt.alignment.displaced_parts import as_taken, brought_together, outvoted, placed_between
+from skyquilt.model.poses import Accuracy
 from tests.alignment.surveys import alignment, prior
 
 
@@ -24,7 +25,7 @@ def survey(true, told, sigma):
     sigmas = np.broadcast_to(sigma, len(true))
     priors = [prior(C, sigma=float(e)) for C, e in zip(told, sigmas, strict=True)]
     found = replace(found, poses=poses, blocks=(tuple(range(len(true))),))
-    return found, [f"{i:03d}.jpg" for i in range(len(true))], priors
+    return found, [f"{i:03d}.jpg" for i in range(len(true))], priors, ["cam"] * len(true)
 
 
 @pytest.mark.parametrize("count", [16, 24, 90])
@@ -36,9 +37,9 @@ def test_a_second_flight_is_brought_to_the_first(count, seed):
     told[begins:, :2] += jump if np.hypot(*(jump := rng.normal(0, 5, 2))) > 4 else (4.0, 3.0)
     moved = brought_together(*survey(true, told, 1.5))
     assert f"{begins:03d}.jpg" in moved.note
-    found, names, priors = survey(true, told, 1.5)
-    assert as_taken(found, names, priors) == tuple(priors)  # not what that one was made with
-    taken = as_taken(replace(found, notes=(moved.note,)), names, priors)
+    found, names, priors, cameras = survey(true, told, 1.5)
+    assert as_taken(found, names, priors, cameras) == tuple(priors)  # not what that was made with
+    taken = as_taken(replace(found, notes=(moved.note,)), names, priors, cameras)
     assert all(np.array_equal(a.map_C, b.map_C) for a, b in zip(taken, moved.priors, strict=True))
     off = np.array([p.map_C[:2] for p in moved.priors]) - true[:, :2]
     assert np.abs(off[begins:].mean(0) - off[:begins].mean(0)).max() < 0.8
@@ -104,3 +105,97 @@ def test_positions_in_a_false_order_are_no_displaced_parts(seed):
     told = true + np.random.default_rng(seed).normal(0, 1.5, true.shape)
     for false in (told[::-1], np.roll(told, 10, axis=0), np.roll(told, -8, axis=0)):
         assert brought_together(*survey(true, false, 5.0)) is None
+
+
+def shifted(count, away, by, seed=0):
+    """Lines of photos with positions of 1.5 m, and those of some shifted, which bends the map."""
+    true = lines(count)
+    told = true + np.random.default_rng(seed).normal(0, 1.5, true.shape)
+    told[away, :2] += by
+    return survey(true, told, 1.5)
+
+
+@pytest.mark.parametrize("by", [(70.0, 70.0), (-12.0, 25.0)])
+@pytest.mark.parametrize("away", [slice(1, None, 3), slice(1, None, 5), [0, 2, 3, 9, 10, 16, 17]])
+def test_positions_of_fewer_photos_are_not_used(away, by):
+    """A second drone whose photos lie among the others, with a false base."""
+    found, names, priors, cameras = shifted(20, away, by)
+    few = np.isin(np.arange(20), np.arange(20)[away])
+    done = outvoted(found, names, priors, cameras)
+    told = np.isfinite([p.map_C[:2] for p in done.priors]).all(1)
+    assert np.array_equal(told, ~few)
+    assert all(a.map_C[2] == b.map_C[2] for a, b in zip(done.priors, priors, strict=True))
+    assert f"positions of {few.sum()} of 20 photos lie {done.apart_m:.0f} m" in done.note
+    assert abs(done.apart_m - np.hypot(*by)) < 3
+
+
+def test_nobody_is_outvoted_without_a_majority_or_where_nothing_is_wrong():
+    for away in (slice(0, 0), slice(0, None, 2)):
+        assert outvoted(*shifted(20, away, (70.0, 70.0))) is None
+    true = lines(24)
+    told = true + np.random.default_rng(4).standard_t(1.2, true.shape)  # errors of all sizes
+    assert outvoted(*survey(true, told, 1.5)) is None
+    found, names, priors, cameras = shifted(24, slice(1, None, 3), (70.0, 70.0))
+    right = {i: replace(found.poses[i], map_C=true[i]) for i in found.poses}
+    as_most = replace(found, poses=right)
+    assert outvoted(as_most, names, priors, cameras) is None
+
+
+def test_flights_with_errors_of_receivers_are_brought_together_and_not_outvoted():
+    case = shifted(24, slice(16, None), (12.0, 9.0))
+    assert outvoted(*case) is None
+    assert brought_together(*case) is not None
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_two_halves_in_different_datums_are_brought_together(seed):
+    case = shifted(20, slice(10, None), (70.0, -70.0), seed)
+    assert outvoted(*case) is None
+    moved = brought_together(*case)
+    off = np.array([p.map_C[:2] for p in moved.priors]) - lines(20)[:, :2]
+    assert np.abs(off[10:].mean(0) - off[:10].mean(0)).max() < 3.0  # 99 m before
+    assert abs(moved.apart_m - 99) < 3
+
+
+def test_a_place_between_two_parts_is_as_uncertain_as_half_of_what_they_are_apart():
+    def told(shared):
+        some = np.zeros((1, 3))
+        return replace(
+            alignment(),
+            accuracy=Accuracy(
+                xyz=some, sigma_m=some, shared_m=shared, focal_share=1.0, design_effect=1.0
+            ),
+        )
+
+    assert placed_between(told((1.5, 3.0)), 99.0).accuracy.shared_m == (49.5, 3.0)
+    assert placed_between(told((1.5, 3.0)), 2.0).accuracy.shared_m == (1.5, 3.0)
+    assert placed_between(told((0.0, 0.0)), 99.0).accuracy.shared_m == (0.0, 0.0)
+    assert placed_between(alignment(), 99.0).accuracy is None
+
+
+@pytest.mark.parametrize("by", [(4.0, 3.0), (9.0, -8.0), (70.0, 70.0)])
+@pytest.mark.parametrize("each", [[0, 1], [0, 1, 1, 0, 2]])
+def test_drones_that_fly_together_are_brought_together(by, each):
+    """Their photos lie among one another, and each one's receiver errs in its own way."""
+    drone = np.resize(each, 30)
+    true = lines(30)
+    told = true + np.random.default_rng(5).normal(0, 0.5, true.shape)
+    told[:, :2] += drone[:, None] * by
+    found, names, priors, _ = survey(true, told, 1.5)
+    assert brought_together(found, names, priors, ["cam"] * 30) is None
+    moved = brought_together(found, names, priors, [f"cam {k}" for k in drone])
+    off = np.array([p.map_C[:2] for p in moved.priors]) - true[:, :2]
+    means = np.array([off[drone == k].mean(0) for k in set(each)])
+    assert np.abs(means - means[0]).max() < 1.0
+    assert "Positions of cam 1" in moved.note and "against those of cam 0 by" in moved.note
+
+
+def test_cameras_of_one_drone_are_no_drones():
+    true = lines(30)
+    told = true + np.random.default_rng(6).normal(0, 1.5, true.shape)
+    found, names, priors, _ = survey(true, told, 1.5)
+    assert brought_together(found, names, priors, [f"cam {k % 2}" for k in range(30)]) is None
+    told[12:, :2] += (5.0, 5.0)  # another flight of the same two
+    found, names, priors, _ = survey(true, told, 1.5)
+    moved = brought_together(found, names, priors, [f"cam {k % 2}" for k in range(30)])
+    assert "from 012.jpg on" in moved.note

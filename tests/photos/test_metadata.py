@@ -51,6 +51,26 @@ def test_xmp_goes_before_exif_in_either_form_and_under_any_prefix(make_jpeg, for
     assert photo.flight_yaw_deg == 46
 
 
+@pytest.mark.parametrize(("orientation", "top"), [(1, 30.0), (6, 120.0), (3, 210.0), (8, 300.0)])
+def test_the_direction_of_a_picture_is_its_heading(make_jpeg, orientation, top):
+    """A picture is turned clockwise by a quarter to be shown by 6: its first row is then right."""
+    gps = {piexif.GPSIFD.GPSImgDirectionRef: "T", piexif.GPSIFD.GPSImgDirection: (3000, 100)}
+    exif = dji_exif(GPS=gps, **{"0th": {piexif.ImageIFD.Orientation: orientation}})
+    photo = read_photo(make_jpeg(exif=exif))
+    assert photo.attitude is None
+    assert (photo.flight_yaw_deg, photo.flight_yaw_source) == (pytest.approx(top), "exif")
+    angles = dji_xmp(GimbalYawDegree="+45", GimbalPitchDegree="-90", GimbalRollDegree="0")
+    photo = read_photo(make_jpeg(exif=exif, xmp=angles))
+    assert photo.attitude.yaw_deg == pytest.approx(45)
+    assert photo.flight_yaw_deg is None
+
+
+@pytest.mark.parametrize("direction", [(0, 100), (99900, 100), (1, 0)])
+def test_a_direction_that_is_none_is_no_heading(make_jpeg, direction):
+    photo = read_photo(make_jpeg(exif=dji_exif(GPS={piexif.GPSIFD.GPSImgDirection: direction})))
+    assert photo.flight_yaw_deg is None
+
+
 def test_rtk_fix_brings_its_deviations_and_the_ellipsoid(make_jpeg):
     xmp = dji_xmp(
         GpsLatitude="46.6",

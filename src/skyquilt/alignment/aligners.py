@@ -156,6 +156,22 @@ class Auto:
         return replace(found, why=why, notes=(*found.notes, *blank, *said))
 
 
+def placed(found: Alignment) -> Alignment:
+    """The same alignment.
+
+    Raises:
+        AlignmentError: it has no photo.
+    """
+    if not found.poses:
+        why = "; ".join(dict.fromkeys(found.rejected.values()))
+        raise AlignmentError(
+            f"none of {len(found.rejected)} photos could be placed ({why}): they are copies of one"
+            " picture, or were taken from one place, and report no positions that place them; map"
+            " one of them by itself, or give positions with --geo"
+        )
+    return found
+
+
 def blank_notes(features: Sequence[Features]) -> tuple[str, ...]:
     """What is said where most photos have next to no keypoints."""
     blank = sum(len(found.px) < KEYPOINTS for found in features)

@@ -12,7 +12,10 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.crowded_positions import without_places
+from skyquilt.alignment.similarity_graph import fit_similarity
 from skyquilt.model.poses import Alignment, Prior
+from skyquilt.photos.side_rows import sentence_of
 
 Complex = NDArray[np.complex128]
 Parts = NDArray[np.int64]
@@ -35,8 +38,22 @@ EXPLAINED, OF_THESE = 2.5, 0.15
 state, or this share of the displacement: positions in a false order misfit by more.
 """
 MOST_APART_M = 40.0
-"""Receivers err by metres: by more than this, positions are wrong in another way, and positions of
-lines in another order can be divided so that they fit.
+"""Receivers err by metres: by more than this, positions are wrong in another way (another datum, a
+false base). Those of fewer photos are then not used at all; and of displacements one alone is
+believed, which must explain them as they state, since lines in another order can be divided so that
+they fit.
+"""
+AGREE, BETWEEN = 5.0, 0.1
+"""Positions agree with most others where they misfit by less than this times what these misfit by
+(median), or state; where more than this share misfit by half as much and more, errors of all sizes
+occur, and nobody is outvoted.
+"""
+OFF = 2.0
+"""Nothing is gained where photos lie nearer than this times their misfit to positions that agree.
+"""
+REACH = 0.5
+"""Photos that outvote others reach as far as all photos, or this share of it: those of one line
+tell little of scale and direction.
 """
 TRUSTED = 0.8
 """Share of the positions that are compared, those that fit best: others may be gross errors."""
@@ -50,52 +67,128 @@ class Displaced:
     """Positions brought together."""
 
     priors: tuple[Prior, ...]
-    """The priors with positions moved by the displacement of their part."""
+    """The priors with positions moved by the displacement of their part, or without those of some.
+    """
     note: str
     """What is said of them."""
+    apart_m: float
+    """How far these positions lie from the others."""
 
 
 def brought_together(
-    found: Alignment, names: Sequence[str], priors: Sequence[Prior]
+    found: Alignment, names: Sequence[str], priors: Sequence[Prior], cameras: Sequence[str]
 ) -> Displaced | None:
     """The priors with the positions of displaced parts brought together, the middle of all staying,
     by their deviations; None where no part is displaced. Photos are in order of capture, under
-    their `names`.
+    their `names` and those of their `cameras`, which may be those of drones that fly together.
     """
     own = [i for i in found.held if np.isfinite(priors[i].map_C[:2]).all()]
     if found.frame.crs is None or len(own) < 2 * FEWEST:
         return None
     placed = np.array([complex(*found.poses[i].map_C[:2]) for i in own])
     told = np.array([complex(*priors[i].map_C[:2]) for i in own])
-    part = _parts(placed, told)
+    part, drones = _parts(placed, told), _drones([cameras[i] for i in own])
+    together = np.zeros(len(own), np.int64)
+    several = _misfit(placed, told, drones) < CLEARER * _misfit(placed, told, together)
+    several &= _misfit(placed, told, drones) < _misfit(placed, told, part)
+    part = drones if several else part
     shift = _shifts(placed, told, part)
     sigma = np.array([float(priors[i].sigma_C[0]) for i in own])
     apart = float(np.abs(np.diff(shift)).max(initial=0.0))
     usual = float(np.median(sigma))
     left = told - _turn(placed, told, part) * placed - shift[part]
-    if not TOLD_APART * usual < apart < MOST_APART_M:
+    if not TOLD_APART * usual < apart:
         return None
-    if float(np.median(np.abs(left))) > max(EXPLAINED * usual, OF_THESE * apart):
+    near = apart < MOST_APART_M
+    if float(np.median(np.abs(left))) > max(EXPLAINED * usual, OF_THESE * apart if near else 0.0):
+        return None
+    if not near and len(shift) > 2 and not several:
         return None
     shift -= np.average(shift[part], weights=sigma**-2)
     moved = list(priors)
     for i, d in zip(own, shift[part], strict=True):
         there = priors[i].map_C - np.array([d.real, d.imag, 0.0])
         moved[i] = replace(priors[i], map_C=there)
-    first = [names[own[k]] for k in np.flatnonzero(np.diff(part)) + 1]
+    first = [int(np.flatnonzero(part == k)[0]) for k in range(1, len(shift))]
+    if several:
+        which = f"of {' and of '.join(cameras[own[k]] for k in first)}"
+        other = f"those of {cameras[own[int(np.flatnonzero(part == 0)[0])]]}"
+    else:
+        which = f"from {' and from '.join(names[own[k]] for k in first)} on"
+        other = "those before"
+    why = "drones with receivers of their own" if several else "another flight"
     note = (
-        f"Positions from {' and from '.join(first)} on are displaced against those before by up to"
-        f" {apart:.1f} m: another flight, or a correction that was lost. {DONE} the map's place is"
-        " as uncertain as that."
+        f"Positions {which} are displaced against {other} by up to {apart:.1f} m: {why}, or a"
+        f" correction that was lost. {DONE} the map's place is as uncertain as that."
     )
-    return Displaced(priors=tuple(moved), note=note)
+    return Displaced(priors=tuple(moved), note=note, apart_m=apart)
 
 
-def as_taken(found: Alignment, names: Sequence[str], priors: Sequence[Prior]) -> tuple[Prior, ...]:
+def outvoted(
+    found: Alignment, names: Sequence[str], priors: Sequence[Prior], cameras: Sequence[str]
+) -> Displaced | None:
+    """The priors without the positions of photos that contradict those of most others, whichever
+    photos these are: a second drone with a false base, files whose positions somebody shifted.
+    Heights stay. None where no majority agrees, or where the map lies by it already; and where
+    parts err as receivers do, which are brought together.
+    """
+    own = [i for i in found.held if np.isfinite(priors[i].map_C[:2]).all()]
+    if found.frame.crs is None or len(own) < 2 * FEWEST:
+        return None
+    placed = np.array([complex(*found.poses[i].map_C[:2]) for i in own])
+    told = np.array([complex(*priors[i].map_C[:2]) for i in own])
+    sigma = np.array([float(priors[i].sigma_C[0]) for i in own])
+    g, c, _ = fit_similarity(placed, told, sigma)
+    off = np.abs(told - g * placed - c)
+    limit = AGREE * max(float(np.median(off)), float(np.median(sigma)))
+    agree = off < limit
+    fit = float(np.median(off[agree])) if agree.any() else np.inf
+    if agree.all() or 2 * agree.sum() <= len(own) or agree.sum() < FEWEST:
+        return None
+    if (agree & (off > limit / 2)).mean() > BETWEEN:
+        return None
+    if np.median(np.abs(told - placed)[agree]) < OFF * max(fit, float(np.median(sigma))):
+        return None
+    if np.std(placed[agree]) < REACH * np.std(placed):
+        return None
+    apart = float(np.median(off[~agree]))
+    if apart < MOST_APART_M and brought_together(found, names, priors, cameras) is not None:
+        return None
+    out, away = list(priors), [i for i, a in zip(own, agree.tolist(), strict=True) if not a]
+    for i, bare in zip(away, without_places([priors[i] for i in away]), strict=True):
+        out[i] = bare
+    note = (
+        f"The positions of {len(away)} of {len(own)} photos lie {apart:.0f} m (median) from where"
+        f" the others and the pictures put them: {sentence_of([names[i] for i in away])}. They are"
+        " not used. If these are the right ones, the map lies elsewhere by as much."
+    )
+    return Displaced(priors=tuple(out), note=note, apart_m=apart)
+
+
+def placed_between(found: Alignment, apart_m: float) -> Alignment:
+    """The alignment, its place in the middle of parts so far apart, any of which may be right."""
+    told = found.accuracy
+    if told is None or not any(told.shared_m):  # held by control points
+        return found
+    flat, up = told.shared_m
+    return replace(found, accuracy=replace(told, shared_m=(max(flat, apart_m / 2), up)))
+
+
+def as_taken(
+    found: Alignment, names: Sequence[str], priors: Sequence[Prior], cameras: Sequence[str]
+) -> tuple[Prior, ...]:
     """The priors as an alignment took them: brought together where it says so."""
     told = any(DONE in note for note in found.notes)
-    together = brought_together(found, names, priors) if told else None
+    together = brought_together(found, names, priors, cameras) if told else None
     return tuple(priors) if together is None else together.priors
+
+
+def _drones(cameras: Sequence[str]) -> Parts:
+    """The part of each photo, those of a camera (name) with enough photos being one, and all others
+    the first.
+    """
+    enough = [c for c in dict.fromkeys(cameras) if cameras.count(c) >= FEWEST]
+    return np.array([enough.index(c) if c in enough else 0 for c in cameras], np.int64)
 
 
 def _parts(placed: Complex, told: Complex) -> Parts:

@@ -92,7 +92,11 @@ def as_enlarged(photos: Sequence[Photo], factors: Mapping[int, float]) -> list[P
 
 
 def misfit_px(found: Alignment) -> float:
-    """Mean distance in px between where photos show tie points and where they project."""
+    """Mean distance in px between where photos show tie points and where they project; infinite
+    without any tie point: photos of one place.
+    """
+    if not len(found.ties.residual_px):
+        return np.inf
     return float(np.linalg.norm(found.ties.residual_px, axis=1).mean())
 
 

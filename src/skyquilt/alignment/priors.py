@@ -231,7 +231,9 @@ def photo_prior(photo: Photo, frame: MapFrame, to_map: Transformer | None) -> Pr
         C[2] = np.nan if zero is None else photo.height_m + zero
         sigma[2] = SIGMA_HEIGHT_M if zero is not None else np.inf
     attitude = photo.attitude
-    yaw = attitude.yaw_deg if attitude else photo.flight_yaw_deg
+    yaw, source = photo.flight_yaw_deg, photo.flight_yaw_source
+    if attitude is not None:
+        yaw, source = attitude.yaw_deg, attitude.source
     return Prior(
         map_C=C,
         sigma_C=sigma,
@@ -240,7 +242,7 @@ def photo_prior(photo: Photo, frame: MapFrame, to_map: Transformer | None) -> Pr
         roll_deg=attitude.roll_deg if attitude else 0.0,
         sigma_yaw_deg=attitude.sigma_yaw_deg if attitude else 15.0,
         sigma_tilt_deg=attitude.sigma_tilt_deg if attitude else 6.0,
-        yaw_source=attitude.source if attitude else ("xmp-flight" if yaw is not None else ""),
+        yaw_source="" if yaw is None else source,
     )
 
 

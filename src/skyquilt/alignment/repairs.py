@@ -10,7 +10,7 @@ from typing import Any
 
 from skyquilt.alignment.crowded_positions import believed
 from skyquilt.alignment.determined import STATED_DEG
-from skyquilt.alignment.displaced_parts import as_taken, brought_together
+from skyquilt.alignment.displaced_parts import as_taken, brought_together, outvoted, placed_between
 from skyquilt.alignment.enlarged import enlarged_note, enlarged_photos, fits_better
 from skyquilt.alignment.false_tilts import common_tilts, leaning_lines, off_told, told_no_tilt
 from skyquilt.alignment.late_positions import as_moved, mirrored, moved_note, on_time, unshifted
@@ -282,6 +282,17 @@ def _late_moments(last: Tried, survey: Survey) -> Tried:
     return _if_nearer(last, survey, late.priors, "late ", late.note)
 
 
+def _outvoted_positions(last: Tried, survey: Survey) -> Tried:
+    """Positions that contradict those of most photos are not used."""
+    priors = last.begun.priors
+    if slanting(priors):
+        return last
+    majority = outvoted(last.found, survey.names, priors, survey.cameras)
+    if majority is None:
+        return last
+    return _if_nearer(last, survey, majority.priors, "outvoted ", majority.note)
+
+
 def _common_tilts(last: Tried, survey: Survey) -> Tried:
     """Tilts with an error that all photos of a camera have in common are corrected by it."""
     priors = last.begun.priors
@@ -353,10 +364,13 @@ def _displaced_parts(last: Tried, survey: Survey) -> Tried:
     priors = last.begun.priors
     if slanting(priors) or last.begun.guess is not None:
         return last
-    together = brought_together(last.found, survey.names, priors)
+    together = brought_together(last.found, survey.names, priors, survey.cameras)
     if together is None:
         return last
-    return _if_nearer(last, survey, together.priors, "together ", together.note)
+    other = _if_nearer(last, survey, together.priors, "together ", together.note)
+    if other is last:
+        return last
+    return replace(other, found=placed_between(other.found, together.apart_m))
 
 
 def _freed(
@@ -398,7 +412,8 @@ def priors_taken(
     reported ones, the rest as of `Survey`.
     """
     priors = lowered(found, believed(found, frame, reported))
-    return as_taken(found, names, as_moved(found, priors, cameras, speeds))
+    moved = as_moved(found, priors, cameras, speeds)
+    return as_taken(found, names, moved, cameras)
 
 
 REPAIRS: tuple[Callable[[Tried, Survey], Tried], ...] = (
@@ -411,6 +426,7 @@ REPAIRS: tuple[Callable[[Tried, Survey], Tried], ...] = (
     _late_positions,
     _leaning_lines,
     _late_moments,
+    _outvoted_positions,
     _common_tilts,
     _false_tilts,
     _guessed_directions,

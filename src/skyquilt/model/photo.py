@@ -200,8 +200,10 @@ class Photo:
     """The camera's attitude as reported."""
     flight_yaw_deg: float | None = None
     """Heading of the aircraft as reported, degrees clockwise from true north; an independent check
-    of the yaw.
+    of the yaw. Without camera angles, that of the image top.
     """
+    flight_yaw_source: str = "xmp-flight"
+    """Where it was read: `xmp-flight`, `exif` (`GPSImgDirection`)."""
     flight_tilt_deg: tuple[float, float] = (0.0, 0.0)
     """Pitch (positive: nose up) and roll (positive: right wing down) of the aircraft as reported,
     degrees; 0 where they are not.

@@ -287,6 +287,21 @@ def read_flight_yaw(xmp: Xmp) -> tuple[float | None, tuple[str, ...]]:
     return None, (f"A flight yaw of {yaw:g} degrees is not possible; it is ignored.",)
 
 
+def read_image_direction(exif: Exif) -> float | None:
+    """Heading of the image top in degrees clockwise from north by EXIF's `GPSImgDirection`, which
+    counts for the picture as it is to be shown (`Orientation`); None where it is absent, or zero,
+    which programs write that know none.
+    """
+    shown = as_number(exif.gps.get(tag.GPS_DIRECTION))
+    if not shown or abs(shown) > _MOST_DEG:
+        return None
+    return (shown + _TURNED_DEG.get(exif.number(tag.ORIENTATION) or 1.0, 0.0)) % 360
+
+
+_TURNED_DEG = {3.0: 180.0, 6.0: 90.0, 8.0: -90.0}
+"""Degrees clockwise by which a picture is turned to be shown, by its `Orientation`."""
+
+
 def read_velocity(xmp: Xmp) -> tuple[float, float, float] | None:
     """Velocity of the aircraft north, east and down in m/s, as DJI writes it; None where it is
     absent or impossible.

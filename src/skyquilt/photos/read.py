@@ -34,6 +34,7 @@ from skyquilt.photos.metadata import (
     read_flight_tilt,
     read_flight_yaw,
     read_height,
+    read_image_direction,
     read_position,
     read_time,
     read_velocity,
@@ -188,6 +189,9 @@ def _photo(path: Path, name: str, header: Header, thermal_unit: str | None) -> P
         lambda: read_attitude(header.xmp), lambda: (None, ()), "camera angles", strange
     )
     flight_yaw, yaw_notes = read_flight_yaw(header.xmp)
+    heading_of = "xmp-flight"
+    if flight_yaw is None and attitude is None:
+        flight_yaw, heading_of = read_image_direction(header.exif), "exif"
     time = _ignoring(
         lambda: read_time(header.exif, header.xmp), lambda: None, "capture time", strange
     )
@@ -218,6 +222,7 @@ def _photo(path: Path, name: str, header: Header, thermal_unit: str | None) -> P
         height_m=None if position else _height(header),
         attitude=attitude,
         flight_yaw_deg=flight_yaw,
+        flight_yaw_source=heading_of,
         flight_tilt_deg=read_flight_tilt(header.xmp),
         time=time,
         orientation_tag=whole(header.exif.tags.get(tag.ORIENTATION), 1, 8) or 1,

@@ -28,7 +28,7 @@ SERIAL, LENS = 0xA431, 0xA434
 EXPOSURE_S, F_NUMBER, ISO, ISO_SPEED = 0x829A, 0x829D, 0x8827, 0x8833
 BITS, BLACK_LEVEL = 258, 50714
 GPS_LAT_REF, GPS_LAT, GPS_LON_REF, GPS_LON, GPS_ALT_REF, GPS_ALT = 1, 2, 3, 4, 5, 6
-GPS_TIME, GPS_ERROR, GPS_DATE = 7, 0x1F, 0x1D
+GPS_TIME, GPS_ERROR, GPS_DATE, GPS_DIRECTION = 7, 0x1F, 0x1D, 0x11
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -94,7 +94,7 @@ _EXIF_TAGS = _COUNT_TAGS | frozenset(
 )
 _GPS_TAGS = frozenset(
     {GPS_LAT_REF, GPS_LAT, GPS_LON_REF, GPS_LON, GPS_ALT_REF, GPS_ALT, GPS_TIME, GPS_ERROR}
-    | {GPS_DATE}
+    | {GPS_DATE, GPS_DIRECTION}
 )
 _FORMS = {1: "B", 2: "s", 3: "H", 4: "I", 5: "II", 6: "b", 7: "s", 8: "h", 9: "i", 10: "ii"} | {
     11: "f",

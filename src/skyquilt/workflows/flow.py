@@ -11,6 +11,7 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from skyquilt.alignment.aligners import placed
 from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.motion import speeds_of
 from skyquilt.alignment.priors import priors
@@ -421,7 +422,7 @@ def _align(known: AlignmentInputs, key: str, methods: Methods, clock: Clock) -> 
 
     def aligned(tell: Callable[[str], None]) -> Alignment:
         resumable = replace(known, keep=replace(keep, told=tell))
-        return store.get_or("alignment", key, lambda: methods.align(resumable))
+        return placed(store.get_or("alignment", key, lambda: methods.align(resumable)))
 
     alignment = yield from apart(aligned, AdjustmentSteps())
     store.forget([ADJUSTING])
