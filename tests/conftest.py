@@ -78,7 +78,7 @@ BEGAN_S = time.monotonic()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """`--within`, for CI: on a slow machine it leaves out what is last instead of taking an hour."""
+    """`--within`, for CI: on a slow machine it leaves out what is last."""
     parser.addoption("--within", type=float, metavar="S", help="skip slow tests that begin later")
 
 

@@ -4,13 +4,18 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from skyquilt.alignment.crowded_positions import believed
+from skyquilt.alignment.displaced_parts import as_taken
+from skyquilt.alignment.late_positions import as_moved
+from skyquilt.alignment.motion import Speeds
+from skyquilt.alignment.oblique_guess import lowered
 from skyquilt.alignment.start import GROSS_DEG, heading_errors
 from skyquilt.geometry.camera import distort
 from skyquilt.geometry.frames import angle_difference_deg
 from skyquilt.model.camera import Camera
 from skyquilt.model.event import MetadataConflict
 from skyquilt.model.photo import Photo
-from skyquilt.model.poses import Alignment, Prior
+from skyquilt.model.poses import Alignment, MapFrame, Prior
 
 CERTAIN = 5.0
 """Deviations, as the flight determines them, by which a calibration's values must be missed, and"""
@@ -214,3 +219,19 @@ def _distortion_px(camera: Camera, told: Camera) -> float:
     corners = np.array([[w, h], [-w, h], [w, -h], [-w, -h]])
     bent = distort(corners, camera.vector) - distort(corners, told.vector)
     return camera.focal * float(np.linalg.norm(bent, axis=1).max())
+
+
+def priors_taken(
+    found: Alignment,
+    frame: MapFrame,
+    reported: Sequence[Prior],
+    names: Sequence[str],
+    cameras: Sequence[str],
+    speeds: Speeds,
+) -> tuple[Prior, ...]:
+    """The reported priors as an alignment took them, by what it says of them; `frame`: that of the
+    reported ones, the rest as of `alignment.repairs.Survey`.
+    """
+    priors = lowered(found, believed(found, frame, reported))
+    moved = as_moved(found, priors, cameras, speeds)
+    return as_taken(found, names, moved, cameras)

@@ -8,12 +8,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from skyquilt.alignment.crowded_positions import believed
 from skyquilt.alignment.determined import STATED_DEG
-from skyquilt.alignment.displaced_parts import as_taken, brought_together, outvoted, placed_between
+from skyquilt.alignment.displaced_parts import brought_together, outvoted, placed_between
 from skyquilt.alignment.enlarged import enlarged_note, enlarged_photos, fits_better
 from skyquilt.alignment.false_tilts import common_tilts, leaning_lines, off_told, told_no_tilt
-from skyquilt.alignment.late_positions import as_moved, mirrored, moved_note, on_time, unshifted
+from skyquilt.alignment.late_positions import mirrored, moved_note, on_time, unshifted
 from skyquilt.alignment.motion import Speeds
 from skyquilt.alignment.oblique import reported_oblique, tilted, turned_deg, without_photos
 from skyquilt.alignment.oblique_guess import (
@@ -45,7 +44,7 @@ from skyquilt.alignment.unfit_cameras import (
     unfit_notes,
 )
 from skyquilt.errors import AlignmentError
-from skyquilt.model.poses import Alignment, MapFrame, Prior
+from skyquilt.model.poses import Alignment, Prior
 
 ENLARGED_AGAIN = 3
 """Photos that are enlarged by other factors are divided so often at most: what fits none of the
@@ -284,10 +283,9 @@ def _late_moments(last: Tried, survey: Survey) -> Tried:
 
 def _outvoted_positions(last: Tried, survey: Survey) -> Tried:
     """Positions that contradict those of most photos are not used."""
-    priors = last.begun.priors
-    if slanting(priors):
+    if slanting(last.begun.priors):
         return last
-    majority = outvoted(last.found, survey.names, priors, survey.cameras)
+    majority = outvoted(last.found, survey.names, last.begun.priors, survey.cameras)
     if majority is None:
         return last
     return _if_nearer(last, survey, majority.priors, "outvoted ", majority.note)
@@ -398,22 +396,6 @@ def _if_nearer(
     if off_positions(other.found, priors) < off_positions(last.found, priors):
         return replace(other, notes=(*last.notes, *notes))
     return last
-
-
-def priors_taken(
-    found: Alignment,
-    frame: MapFrame,
-    reported: Sequence[Prior],
-    names: Sequence[str],
-    cameras: Sequence[str],
-    speeds: Speeds,
-) -> tuple[Prior, ...]:
-    """The reported priors as an alignment took them, by what it says of them; `frame`: that of the
-    reported ones, the rest as of `Survey`.
-    """
-    priors = lowered(found, believed(found, frame, reported))
-    moved = as_moved(found, priors, cameras, speeds)
-    return as_taken(found, names, moved, cameras)
 
 
 REPAIRS: tuple[Callable[[Tried, Survey], Tried], ...] = (

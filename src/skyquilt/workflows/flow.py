@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from skyquilt.alignment.aligners import placed
+from skyquilt.alignment.conflicts import priors_taken
 from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.motion import speeds_of
 from skyquilt.alignment.priors import priors
 from skyquilt.alignment.progress import AdjustmentSteps
-from skyquilt.alignment.repairs import priors_taken
 from skyquilt.engine.clock import Clock, CountedParts, Steps, apart
 from skyquilt.engine.free_memory import give_back_growth
 from skyquilt.engine.pixel_cache import PixelCache, pixel_budget, resident_budget
