@@ -32,8 +32,10 @@ without a photo.
 """
 FULL_S = 2.0
 """Pause in s when the disk is full."""
-GONE_S = 10.0
-"""The map ends where the survey's folder has been gone for this time in s."""
+GONE_S = 120.0
+"""The map ends where its folder has been gone for this time in s; a network disk comes back
+before.
+"""
 STEADY_S = 5.0
 """With `finish`: if no photo arrives for this time in s, the flight is over."""
 
