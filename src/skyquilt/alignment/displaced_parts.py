@@ -1,13 +1,15 @@
-"""Parts of a survey whose positions are displaced against those before: another battery, another
-day, a correction service that was lost.
+"""Positions of a part of a survey that are displaced against the others: another battery, another
+day, another drone, a correction service that was lost.
 
 A receiver's error hardly changes within a flight and is another in the next. Taken for one, two
-flights beside each other stretch or shrink the map by the difference.
+flights beside each other stretch or shrink the map by the difference. Positions of a few photos
+that are off by more than receivers err are outvoted by the others.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,6 +77,32 @@ class Displaced:
     """How far these positions lie from the others."""
 
 
+class _Compared(NamedTuple):
+    """Photos whose positions are told, in order of capture."""
+
+    own: list[int]
+    """Their numbers."""
+    placed: Complex
+    """(n,) where they were found, x + iy in m."""
+    told: Complex
+    """(n,) where they tell that they are."""
+    sigma: NDArray[np.float64]
+    """(n,) deviations of that in m."""
+
+
+def _compared(found: Alignment, priors: Sequence[Prior]) -> _Compared | None:
+    """The photos that tell of displaced positions; None where they are too few."""
+    own = [i for i in found.held if np.isfinite(priors[i].map_C[:2]).all()]
+    if found.frame.crs is None or len(own) < 2 * FEWEST:
+        return None
+    return _Compared(
+        own=own,
+        placed=np.array([complex(*found.poses[i].map_C[:2]) for i in own]),
+        told=np.array([complex(*priors[i].map_C[:2]) for i in own]),
+        sigma=np.array([float(priors[i].sigma_C[0]) for i in own]),
+    )
+
+
 def brought_together(
     found: Alignment, names: Sequence[str], priors: Sequence[Prior], cameras: Sequence[str]
 ) -> Displaced | None:
@@ -82,18 +110,16 @@ def brought_together(
     by their deviations; None where no part is displaced. Photos are in order of capture, under
     their `names` and those of their `cameras`, which may be those of drones that fly together.
     """
-    own = [i for i in found.held if np.isfinite(priors[i].map_C[:2]).all()]
-    if found.frame.crs is None or len(own) < 2 * FEWEST:
+    positions = _compared(found, priors)
+    if positions is None:
         return None
-    placed = np.array([complex(*found.poses[i].map_C[:2]) for i in own])
-    told = np.array([complex(*priors[i].map_C[:2]) for i in own])
+    own, placed, told, sigma = positions
     part, drones = _parts(placed, told), _drones([cameras[i] for i in own])
     together = np.zeros(len(own), np.int64)
     several = _misfit(placed, told, drones) < CLEARER * _misfit(placed, told, together)
     several &= _misfit(placed, told, drones) < _misfit(placed, told, part)
     part = drones if several else part
     shift = _shifts(placed, told, part)
-    sigma = np.array([float(priors[i].sigma_C[0]) for i in own])
     apart = float(np.abs(np.diff(shift)).max(initial=0.0))
     usual = float(np.median(sigma))
     left = told - _turn(placed, told, part) * placed - shift[part]
@@ -132,12 +158,10 @@ def outvoted(
     Heights stay. None where no majority agrees, or where the map lies by it already; and where
     parts err as receivers do, which are brought together.
     """
-    own = [i for i in found.held if np.isfinite(priors[i].map_C[:2]).all()]
-    if found.frame.crs is None or len(own) < 2 * FEWEST:
+    positions = _compared(found, priors)
+    if positions is None:
         return None
-    placed = np.array([complex(*found.poses[i].map_C[:2]) for i in own])
-    told = np.array([complex(*priors[i].map_C[:2]) for i in own])
-    sigma = np.array([float(priors[i].sigma_C[0]) for i in own])
+    own, placed, told, sigma = positions
     g, c, _ = fit_similarity(placed, told, sigma)
     off = np.abs(told - g * placed - c)
     limit = AGREE * max(float(np.median(off)), float(np.median(sigma)))
