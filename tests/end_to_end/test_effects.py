@@ -94,16 +94,20 @@ CHANGES = {
     "levelled": False,
 }
 """Another value of each setting that a rule names."""
+RARE = ("image", "hybrid", "flightline")
 BESIDE = (
     {},
     {"method": "image", "levelled": False},
     pytest.param({"method": "image", "estimator": "ncc"}, marks=pytest.mark.long),
     pytest.param({"method": "hybrid", "optimiser": "anneal"}, marks=pytest.mark.long),
     {"method": "pose", "repair": False},
-    {"blend": "first"},
+    pytest.param({"blend": "first"}, marks=pytest.mark.long),
     {"compress": "deflate"},
-    *({"method": name} for name in METHODS if name not in ("auto", "bundle", "flightline")),
-    pytest.param({"method": "flightline"}, marks=pytest.mark.long),
+    *(
+        pytest.param({"method": name}, marks=pytest.mark.long if name in RARE else ())
+        for name in METHODS
+        if name not in ("auto", "bundle")
+    ),
 )
 LATENT = {("auto", "height_m"), ("image", "height_m"), ("image", "relief_m")}
 """Of use where photos say less than these do."""

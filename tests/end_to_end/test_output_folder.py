@@ -40,6 +40,10 @@ def late(value):
     return pytest.param(value, marks=pytest.mark.slow)
 
 
+def last(value):
+    return pytest.param(value, marks=[pytest.mark.slow, pytest.mark.long])
+
+
 def same_result(a: Path, b: Path) -> None:
     """Equal rasters and equal figures, times aside."""
     for name in RASTERS:
@@ -440,7 +444,9 @@ def with_options(moment: tuple[str, str, int], request: pytest.FixtureRequest) -
     return SLOWER, request.getfixturevalue("undisturbed")
 
 
-@pytest.mark.parametrize("moment", [MOMENTS[1], *map(late, (MOMENTS[0], *MOMENTS[2:]))])
+@pytest.mark.parametrize(
+    "moment", [MOMENTS[1], *map(late, MOMENTS[3::2]), *map(last, MOMENTS[::2])]
+)
 def test_ctrl_c_ends_soon_and_the_same_command_resumes(mosaic, flight, tmp_path, request, moment):
     options, undisturbed = with_options(moment, request)
     running = Running(flight / "photos", tmp_path / "out", *options)
@@ -483,10 +489,10 @@ def test_ctrl_c_twice(flight, tmp_path):
     "moment",
     [
         ("StageProgress", "features", 4),
-        ("StageStarted", "links", 1),
+        last(("StageStarted", "links", 1)),
         ("StageStarted", "mosaic", 1),
         ("StageFinished", "mosaic", 1),
-        ("StageStarted", "report", 1),
+        last(("StageStarted", "report", 1)),
     ],
 )
 def test_kill_9_and_the_same_command_resumes(mosaic, flight, tmp_path, request, moment):

@@ -46,6 +46,7 @@ def line(tmp_path_factory):
     )
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_blocks_that_lie_apart_become_one_where_they_meet(line, tmp_path, monkeypatch):
     """The positions of the last six are displaced. Links with these contradicted those with the

@@ -212,6 +212,7 @@ def test_a_real_full_disk_refuses_and_loses_nothing(flight, small_disk):
     other.close()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_disk_that_is_full_from_each_write_point_on(drones, small_disk):
     """No byte is left from the moment on at which a photo passes the point; with room again it goes

@@ -47,7 +47,7 @@ def moved(photo, folder, place):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("place", [SYDNEY, NEXT_ZONE])
+@pytest.mark.parametrize("place", [SYDNEY, pytest.param(NEXT_ZONE, marks=pytest.mark.long)])
 @pytest.mark.parametrize("strangers", [pytest.param(1, marks=pytest.mark.long), 2])
 def test_a_map_that_began_elsewhere_is_begun_again_where_most_photos_are(
     flight, tmp_path, place, strangers

@@ -475,6 +475,7 @@ def test_a_flood_of_tiny_requests_is_answered_and_nothing_is_lost(site):
     assert site.web.get("/info").json()["counts"]["refused"] == refused + 200
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_ten_thousand_tiny_requests(site):
     before = site.states()

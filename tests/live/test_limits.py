@@ -498,7 +498,9 @@ def test_many_of_the_largest_images_at_once(site):
     many = 16
     side = int(MOST_PIXELS**0.5)
     query = f"{MAP}&BBOX={box(site)}&LAYERS=mosaic&WIDTH={side}&HEIGHT={side}&TRANSPARENT=TRUE"
+    began = time.process_time()
     assert site.get(query).status_code == 200
+    alone = time.process_time() - began
     before, most, said, done = resident_mb(), [0.0], [], threading.Event()
 
     def watch():
@@ -525,7 +527,7 @@ def test_many_of_the_largest_images_at_once(site):
     watching.join()
     assert said == [200] * many
     # of the clients here too; noise is the worst that PNG can meet, a map takes two thirds of it
-    assert spent / many < 1.3
+    assert spent / many < 1.5 * alone
     assert most[0] - before < 2 * 200 + many * 13
     time.sleep(1.0)
     assert resident_mb() - before < 150
@@ -536,7 +538,7 @@ def test_many_of_the_largest_images_at_once(site):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("what", ["mosaic", "live"])
+@pytest.mark.parametrize("what", ["mosaic", pytest.param("live", marks=pytest.mark.long)])
 def test_a_run_that_takes_too_much_memory_ends_with_a_sentence(flight, tmp_path, what):
     """And the same command with more memory goes on."""
     words = [sys.executable, "-m", "skyquilt", what, str(flight.folder / "photos"), "-o"]

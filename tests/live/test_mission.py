@@ -111,7 +111,7 @@ def watched(folder, plan):
                 live.close()
 
 
-def until(holds, seconds=300.0):
+def until(holds, seconds=300):
     for _ in range(seconds * 10):
         if holds():
             return
