@@ -495,7 +495,8 @@ def test_photos_without_angles_are_guessed_to_look_at_the_middle():
     assert np.median(flown.errors(found)[0]) < 2.0
 
 
-@pytest.mark.parametrize("pitch", [30, pytest.param(40, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("pitch", [30, pytest.param(40, marks=pytest.mark.long)])
 def test_tilts_that_all_photos_have_in_common_are_found(pitch):
     """Without camera angles they were taken to look down, and the map was tilted in their place."""
     lines = [
