@@ -31,9 +31,8 @@ def test_the_same_map_though_a_worker_dies_in_each_stage(flight, finished, tmp_p
     killed = set()
     for event in iter_mosaic("photos", tmp_path / "out", settings):
         if isinstance(event, StageProgress) and event.stage not in killed:
-            deadline = (
-                time.monotonic() + 300
-            )  # the one killed before may be the last, and come back
+            # the one killed before may be the last, and come back
+            deadline = time.monotonic() + 300
             while not (victims := workers()) and time.monotonic() < deadline:
                 time.sleep(0.1)
             assert victims, "no process works for this run"
