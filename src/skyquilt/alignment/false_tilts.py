@@ -128,9 +128,8 @@ def common_tilts(
             continue
         axis = np.array([-x[1], x[0], 0.0])
         back = rotation_from_vector(axis / np.linalg.norm(axis) * np.radians(off))
-        for i, prior in enumerate(priors):
-            if cameras[i] == name and prior.sigma_tilt_deg <= STATED_DEG:
-                corrected[i] = turned_prior(prior, back)
+        for i in _stated_by(name, priors, cameras):
+            corrected[i] = turned_prior(priors[i], back)
         said.append(COMMON_NOTE.format(name, off))
     return (corrected if said else priors), tuple(said)
 
@@ -156,11 +155,16 @@ def leaning_lines(
         off = float(np.degrees(np.arctan(rise)) + np.median(beside))
         if rise == 0.0 or abs(off) <= LEAN_DEG:
             continue
-        for i, prior in enumerate(priors):
-            if cameras[i] == name and prior.sigma_tilt_deg <= STATED_DEG:
-                corrected[i] = replace(prior, pitch_deg=prior.pitch_deg - off)
+        for i in _stated_by(name, priors, cameras):
+            corrected[i] = replace(priors[i], pitch_deg=priors[i].pitch_deg - off)
         said.append(COMMON_NOTE.format(name, abs(off)))
     return (corrected if said else priors), tuple(said)
+
+
+def _stated_by(camera: str, priors: Sequence[Prior], cameras: Sequence[str]) -> list[int]:
+    """The photos of a camera that tell their tilts."""
+    own = (i for i, name in enumerate(cameras) if name == camera)
+    return [i for i in own if priors[i].sigma_tilt_deg <= STATED_DEG]
 
 
 def _rise(found: Alignment, priors: Sequence[Prior], own: Sequence[int]) -> float:
