@@ -39,6 +39,10 @@ def pose(x, y, *, z=60.0, yaw=0.0, pitch=0.0, roll=0.0):
     return Pose(cam_R_map=cam_R_map_from_angles(yaw, pitch, roll), map_C=np.array([x, y, z]))
 
 
+def cam_R_map_of(poses):
+    return np.array([p.cam_R_map for p in poses])
+
+
 def hills(count, seed=0, wide=80.0):
     rng = np.random.default_rng(seed)
     return np.column_stack([rng.uniform(-wide, wide, (count, 2)), rng.normal(0, 2, count)])
@@ -262,6 +266,22 @@ def test_ground_is_a_slope_where_photos_of_several_headings_or_one_height_look_t
     assert (np.median(tilts) < 2) == vertical
     ground = np.degrees(np.arccos(dominant_normal(again.ties.xyz, 1.8)[2]))
     assert ground == pytest.approx(slope if vertical else 0.0, abs=1.0)
+
+
+@pytest.mark.parametrize(("slope", "climb", "most"), [(4.0, 0.0, 0.9), (4.0, 4.0, 2.5)])
+def test_ground_that_slopes_a_little_tilts_a_map_less_than_it_slopes(slope, climb, most):
+    """Axes 1 degree off one by one, and level flight, or flight along the slope, count as well."""
+    rng = np.random.default_rng(5)
+    xyz = hills(2000) * (1, 1, 0.1)
+    xyz[:, 2] += np.tan(np.radians(slope)) * xyz[:, 0]
+    flown = [
+        pose(x, y, z=60 + np.tan(np.radians(climb)) * x, yaw=yaw, pitch=rng.normal(0, 1))
+        for y, yaw in zip((-30, 0, 30), (0, 180, 0), strict=True)
+        for x in (-40, -20, 0, 20, 40)
+    ]
+    again = levelled(block(flown, xyz))
+    leaning = cam_R_map_of(flown).transpose(0, 2, 1) @ cam_R_map_of(again.poses.values())
+    assert np.degrees(np.arccos(leaning[:, 2, 2])).max() < most
 
 
 def test_a_photo_without_links_is_not_drawn_over_what_others_show():
