@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from skyquilt.alignment.determined import STATED_DEG
 from skyquilt.alignment.priors import empty_prior
@@ -108,7 +109,7 @@ def common_tilts(
     camera = np.array([names.index(cameras[i]) for i in own])
     tangents = np.array([told[i][:2] / told[i][2] for i in own])
     turns = _turns(np.array([_sensor(found, i) for i in own]), camera)
-    seen = (turns, tangents, np.radians(LEAST_SCATTER_DEG))
+    seen = _Group(turns, tangents, np.radians(LEAST_SCATTER_DEG))
     fit = _fitted(seen)
     C = np.array([found.poses[i].map_C for i in own])
     high = np.array([priors[i].map_C[2] for i in own]) - C[:, 2]
@@ -117,8 +118,10 @@ def common_tilts(
     if not settled and len(known) >= FEWEST:
         scatter = LEAST_NOISE * float(np.median([priors[i].sigma_C[2] for i in own]))
         first = 2 * len(names)
-        rows, high = _heights(C[known], high[known], np.array(own)[known], camera[known], first)
-        fit = _fitted(seen, (rows, high, scatter))
+        rows, high, lines = _heights(
+            C[known], high[known], np.array(own)[known], camera[known], first
+        )
+        fit = _fitted(seen, _Group(rows, high, scatter, lines))
     said, corrected = [], list(priors)
     for number, name in enumerate(names):
         x = _known(fit, number)
@@ -183,12 +186,12 @@ def _rise(found: Alignment, priors: Sequence[Prior], own: Sequence[int]) -> floa
     least = LEAST_NOISE * float(np.median([priors[i].sigma_C[2] for i in own]))
     one, when = np.ones(len(own)), np.linspace(-1, 1, len(own))
     leaning, drifting = (
-        _fitted((np.stack(rows, axis=1)[:, None], high[:, None], least))
+        _fitted(_Group(np.stack(rows, axis=1)[:, None], high[:, None], least))
         for rows in ([one, when, ahead], [one, when])
     )
     rise, sigma = float(leaning.x[2]), float(np.sqrt(leaning.covariance[2, 2]))
     left, without = (float(np.median(fit.left)) for fit in (leaning, drifting))
-    told = abs(rise) > COMMON_DEVIATIONS * sigma and left < COMMON_LEFT * without
+    told = abs(rise) > leaning.most * sigma and left < COMMON_LEFT * without
     return rise if told else 0.0
 
 
@@ -196,7 +199,7 @@ def _settled(fit: "_Fit", camera: int) -> bool:
     """Whether an error of `COMMON_DEG` of a camera would be told from chance."""
     own = slice(2 * camera, 2 * camera + 2)
     most = float(np.linalg.eigvalsh(fit.covariance[own, own])[-1])
-    return bool(COMMON_DEVIATIONS * np.sqrt(most) < np.radians(COMMON_DEG))
+    return bool(fit.most * np.sqrt(most) < np.radians(COMMON_DEG))
 
 
 def _known(fit: "_Fit", camera: int) -> Array:
@@ -206,7 +209,7 @@ def _known(fit: "_Fit", camera: int) -> Array:
     own = slice(2 * camera, 2 * camera + 2)
     variance, axes = np.linalg.eigh(fit.covariance[own, own])
     along = axes.T @ fit.x[own]
-    known = COMMON_DEVIATIONS * np.sqrt(variance) < np.maximum(abs(along), np.radians(COMMON_DEG))
+    known = fit.most * np.sqrt(variance) < np.maximum(abs(along), np.radians(COMMON_DEG))
     return np.asarray(axes @ (along * known))
 
 
@@ -230,11 +233,12 @@ def _turns(cam_R_map: Array, camera: NDArray[np.int64]) -> Array:
 
 def _heights(
     C: Array, high: Array, order: NDArray[np.int64], camera: NDArray[np.int64], first: int
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array, int]:
     """(n, 1, l) by how many m heights told are above those found per unit of the unknowns of
     `_turns`, of which those of the map begin at `first`, and then per m of each camera's drift over
     the flight; and (n, 1) by how many they are, of `high` (n,). Both from the mean of each line:
-    whatever a drift does from line to line, only what turns with lines there and back counts.
+    whatever a drift does from line to line, only what turns with lines there and back counts. And
+    the number of lines.
     """
     rows, each = np.zeros((len(C), first + 2 + first // 2)), np.arange(len(C))
     rows[:, first] = -C[:, 1]
@@ -245,7 +249,7 @@ def _heights(
     for values in (rows.T, high[None]):
         for own in values:
             own -= (np.bincount(line, own) / count)[line]
-    return rows[:, None], high[:, None]
+    return rows[:, None], high[:, None], len(count)
 
 
 def _lines(C: Array, camera: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -268,6 +272,20 @@ def _lines(C: Array, camera: NDArray[np.int64]) -> NDArray[np.int64]:
     return line
 
 
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """Observations alike."""
+
+    rows: Array
+    """(n, d, k) by how much each moves per unit of the unknowns."""
+    told: Array
+    """(n, d) observed."""
+    least: float
+    """The least that they scatter by."""
+    means: int = 0
+    """Means that were taken off them."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Fit:
     """Unknowns found by iteratively reweighted least squares."""
@@ -278,29 +296,41 @@ class _Fit:
     """(k, k) of them."""
     left: Array
     """(n,) lengths of what is left of the first group's observations."""
-
-
-def _fitted(*groups: tuple[Array, Array, float]) -> _Fit:
-    """The unknowns by groups of observations alike: rows (n, d, k), of which later groups may have
-    more unknowns, observed (n, d), and the least that these scatter by.
+    most: float
+    """Deviations that chance exceeds as rarely as `COMMON_DEVIATIONS` of a known scatter; this one
+    is estimated from what is left (Student 1908).
     """
-    k = groups[-1][0].shape[2]
-    total = sum(observed.size for _, observed, _ in groups)
+
+
+def _fitted(*groups: _Group) -> _Fit:
+    """The unknowns by groups of observations alike, of which later groups may have more unknowns.
+
+    Few observations fit unknowns by chance, so what is left of them is less than what they scatter
+    by: of n observations that settle f unknowns, by the square root of (n - f) / n.
+    """
+    k = groups[-1].rows.shape[2]
     x: NDArray[Any] = np.zeros(k)
-    left: list[Array] = []
+    settled = [0.0 for _ in groups]
     for again in range(ROUNDS):
-        N, y = np.eye(k) * WIDEST**-2, np.zeros(k)
-        own = [rows @ x[: rows.shape[2]] for rows, _, _ in groups]
-        left = [np.linalg.norm(g[1] - o, axis=1) for g, o in zip(groups, own, strict=True)]
-        for (rows, observed, least), away in zip(groups, left, strict=True):
-            scatter = max(float(np.median(away)) / MEDIAN_LENGTH[observed.shape[1]], least)
+        N, y, parts = np.eye(k) * WIDEST**-2, np.zeros(k), []
+        left = [np.linalg.norm(g.told - g.rows @ x[: g.rows.shape[2]], axis=1) for g in groups]
+        for g, away, fixed in zip(groups, left, settled, strict=True):
+            free = max(g.told.size - g.means - fixed, 1.0)
+            one = float(np.median(away)) / MEDIAN_LENGTH[g.told.shape[1]]
+            scatter = max(one * np.sqrt(g.told.size / free), g.least)
             far = (away / (CUT * scatter)) ** 2 if again else np.zeros(len(away))
-            weight, known = scatter**-2 / (1 + far), slice(rows.shape[2])
-            N[known, known] += np.einsum("n,nij,nik->jk", weight, rows, rows)
-            y[known] += np.einsum("n,nij,ni->j", weight, rows, observed)
-        x = np.asarray(np.linalg.solve(N, y))
-    few = total / max(total - k, 1)  # so few that they fit by chance
-    return _Fit(x=x, covariance=few * np.linalg.inv(N), left=left[0])
+            weight, known = scatter**-2 / (1 + far), slice(g.rows.shape[2])
+            own = np.zeros((k, k))
+            own[known, known] = np.einsum("n,nij,nik->jk", weight, g.rows, g.rows)
+            y[known] += np.einsum("n,nij,ni->j", weight, g.rows, g.told)
+            N += own
+            parts.append(own)
+        covariance = np.linalg.inv(N)
+        x = np.asarray(covariance @ y)
+        settled = [float((covariance * own).sum()) for own in parts]
+    free = min(g.told.size - g.means - f for g, f in zip(groups, settled, strict=True))
+    most = stats.t.isf(stats.norm.sf(COMMON_DEVIATIONS), max(free, 1.0))
+    return _Fit(x=x, covariance=np.asarray(covariance), left=left[0], most=float(most))
 
 
 def turned_prior(prior: Prior, back: Array) -> Prior:
