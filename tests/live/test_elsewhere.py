@@ -9,7 +9,7 @@ import pytest
 import rasterio
 import simplejpeg
 
-from skyquilt.live.initial_pose import FEW, NOWHERE
+from skyquilt.live.initial_pose import CLIMBED, FEW, NOWHERE
 from skyquilt.live.live_map import LiveMap
 from skyquilt.live.members import FAR_M
 from skyquilt.live.settings import LiveSettings
@@ -96,6 +96,28 @@ def test_a_map_of_many_photos_stays_where_it_is(flight, tmp_path):
     live.members.near = []
     assert live.initial_pose.elsewhere(member)
     live.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("climb", [1, pytest.param(2, marks=pytest.mark.long)])
+def test_a_map_that_began_in_the_climb_is_begun_again_with_larger_pixels(flight, tmp_path, climb):
+    """Pixels for a photo from 4 m, on a flight at 60 m, are 225 tiles where one is enough."""
+    first = []
+    for path in flight.photos[:climb]:
+        first.append(shutil.copyfile(path, tmp_path / path.name))
+        relabel(first[-1], heights=-56.0)
+    rest = flight.photos[climb:]
+    live = LiveMap(tmp_path / "out", QUICK)
+    for path in (*first, *rest[: climb + 1]):
+        live.add(path)
+    straight = LiveMap(tmp_path / "straight", QUICK)
+    straight.add(rest[climb])
+    for what in ("gsd", "cell"):
+        assert live.ledger.meta(what) == straight.ledger.meta(what)
+    assert notes(live).count(f"{CLIMBED}.") == 1
+    assert live.ledger.counts()["refined"] > climb
+    live.close()
+    straight.close()
 
 
 @pytest.mark.slow

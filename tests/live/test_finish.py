@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -18,9 +19,12 @@ from PIL import Image
 from rasterio.enums import Resampling
 from rasterio.vrt import WarpedVRT
 
-from skyquilt.errors import UsageError
+from skyquilt.errors import NoPhotosError, UsageError
+from skyquilt.live import workflow
 from skyquilt.live.live_map import LiveMap
 from skyquilt.live.settings import LiveSettings
+from skyquilt.live.workflow import iter_live
+from skyquilt.model.event import Note, Result
 from skyquilt.raster.map_source import mercator
 from skyquilt.server.access import Guard
 from skyquilt.server.server_thread import ServerThread
@@ -51,6 +55,50 @@ def test_the_final_map_takes_every_photo_that_was_taken(flight, tmp_path, monkey
     live.close()
     list(final_map.iter_finish(tmp_path / "out", settings))
     assert seen[0].input.max_mp == 500.0
+
+
+def told_of_finishing(live, stop):
+    """What a map says of its final map until `stop`, and the last state of that."""
+    for _ in iter_live([], live, stop=stop):
+        pass
+    told = live.ledger.told(0)
+    states = [json.loads(body)["state"] for _, kind, body in told if kind == "finish"]
+    state = live.ledger.meta("finish")
+    live.close()
+    return states, state
+
+
+def test_a_final_map_that_was_interrupted_can_be_asked_for_again(tmp_path, monkeypatch):
+    """The page had said for ever that it is being made, and its button could not be pressed."""
+    live, stop = LiveMap(tmp_path, QUICK), threading.Event()
+    live.ledger.put_meta("finish", "asked")
+    monkeypatch.setattr(workflow, "iter_finish", lambda *_: iter([Note(text="begun")]))
+    assert next(iter_live([], live, stop=stop)) == Note(text="begun")
+    live.close()  # the process was killed
+    monkeypatch.setattr(LiveMap, "work", lambda _: stop.set())
+    states, state = told_of_finishing(LiveMap(tmp_path, QUICK), stop)
+    assert (states, state) == (["running", "failed"], "failed")
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_final_map_that_is_asked_for_while_one_is_made_is_made_too(tmp_path, monkeypatch, fails):
+    live, stop, made = LiveMap(tmp_path, QUICK), threading.Event(), []
+
+    def finishing(*_):
+        made.append(live.ledger.meta("finish"))
+        if len(made) == 1:
+            live.ledger.put_meta("finish", "asked")
+        if fails:
+            raise NoPhotosError("none")
+        yield Result(output=tmp_path, metrics={})
+
+    rounds = iter([None, None, stop.set])
+    monkeypatch.setattr(live, "work", lambda: (next(rounds) or bool)() or None)
+    live.ledger.put_meta("finish", "asked")
+    monkeypatch.setattr(workflow, "iter_finish", finishing)
+    end = "failed" if fails else "done"
+    assert told_of_finishing(live, stop) == (["running", end, "running", end], end)
+    assert made == ["running", "running"]
 
 
 @pytest.fixture(scope="module")

@@ -224,6 +224,19 @@ def test_what_is_no_photo_is_refused_and_gone(site, client):
     assert not left(site)
 
 
+@pytest.mark.parametrize("name", ["DJI_0001.DNG", "img.arw", "DJI_0002.LRV", "GX01.thm"])
+def test_what_is_not_read_by_its_name_is_refused_before_it_is_sent(site, client, flight, name):
+    """Whoever dropped a card's folder on the page had waited for every raw picture."""
+    answer = client.create(30_000_000, filename=name, source="browser")
+    assert answer.status_code == 422
+    assert "read" in answer.json()["reason"]
+    whole = site.web.post(f"/photos?name={name}", content=flight.photos[0].read_bytes())
+    assert whole.json() == answer.json()
+    query = "select count(*) from refused where name = ?"
+    assert site.live.ledger.row(query, name) == (2,)
+    assert not left(site)
+
+
 def test_an_upload_can_be_ended(site, client):
     place = begun(client)
     assert client.patch(place, 0, b"x").status_code == 204

@@ -334,7 +334,7 @@ def test_photos_without_their_ending_are_told(make_jpeg):
     folder = flight(make_jpeg, 3)
     for name in ("12345", "sub/p9.JPG.download"):
         make_jpeg(name, exif=dji_exif(), seed=40)
-    for name in ("p1.JPG_original", "p1.THM", "a.insp"):
+    for name in ("p1.JPG_original", "p1.THM", "of_a_video.THM", "a.insp"):
         make_jpeg(name, seed=41)
     (folder / "text").write_text("no photo")
     (told,) = [n for n in read_survey(folder).notes if "by content" in n]

@@ -17,6 +17,7 @@ from skyquilt.live.ledger import hit
 from skyquilt.live.members import FAR_M, Member, Queues, about_record
 from skyquilt.live.photo_intake import BAND, OTHER_BAND, of_other_band
 from skyquilt.live.redraw_queue import RedrawQueue
+from skyquilt.model.photo import Photo
 from skyquilt.ortho.ground import round_gsd
 from skyquilt.outside import whole
 from skyquilt.photos.implausible_positions import on_sphere
@@ -35,8 +36,16 @@ NOWHERE = (
     "no photo has a position so far: the map begins with the first that has one, or, without a"
     " place, with four that overlap; the final map (--finish, or the button) needs none"
 )
-ABOVE_M = 50.0
-"""Assumed flying height in m where the metadata do not contain one."""
+ABOVE_M, GROUND_M, LOWEST_M = 50.0, 3.0, 5.0
+"""Assumed flying height in m where the metadata do not contain one; height above take-off below
+which a photo was taken on the ground; least one by which the map's pixel is chosen.
+"""
+HIGHER = 2.0
+"""A map of few photos is begun again where more of them were taken so many times higher."""
+CLIMBED = (
+    "the first photos were taken on the way up: the map is begun again with larger pixels, for"
+    " those from higher up"
+)
 
 
 class InitialPose:
@@ -109,6 +118,23 @@ class InitialPose:
         )
         xyz = on_sphere(list(islice(known, 2 * FEW + 1)))
         return int((np.linalg.norm(xyz - xyz[0], axis=1) <= FAR_M).sum()) > begun
+
+    def from_higher(self, member: Member) -> bool:
+        """Whether the map began with a photo of the climb: more photos up to this one were taken so
+        much higher that its pixels are far too fine for them, and it has few.
+        """
+        if bisect_right(self.members.near, member.id) > FEW or member.id <= self._begun_at():
+            return False
+        known = [
+            m
+            for m in self.members.by_id.values()
+            if m.id <= member.id
+            and m.state in ("received", "placed", "refined")
+            and m.photo.position is not None
+        ]
+        least = HIGHER * _above_m(self._first(known[0]).photo) if known else np.inf
+        higher = [m for m in known if _above_m(m.photo) > least]
+        return member in higher and 2 * len(higher) > len(known)
 
     def _first(self, member: Member) -> Member:
         """The photo with which the map begins: the one around which it is begun again, or this
@@ -203,12 +229,10 @@ class InitialPose:
         """Fixes the map's frame and pixel size for the whole survey, with a warning, if any."""
         prior, photo, frame = member.prior, member.photo, self.members.frame
         assert frame is not None
-        takeoff = frame.vertical_datum == "takeoff"
-        pose = self.metadata.first(member)
-        above = max(float(pose.map_C[2]), 5.0) if takeoff and pose is not None else ABOVE_M
+        above = _above_m(photo)
         asked = self.metadata.settings.gsd_cm
         gsd = asked / 100 if asked else round_gsd(3 * above / photo.focal.px)
-        ground = 0.0 if takeoff else float(prior.map_C[2]) - above
+        ground = 0.0 if frame.vertical_datum == "takeoff" else float(prior.map_C[2]) - above
         ground = ground if np.isfinite(ground) else 0.0
         self.fix(gsd, above, ground, warning)
 
@@ -228,3 +252,9 @@ class InitialPose:
             self.ledger.tell("map", {"crs": frame.crs, "gsd": gsd})
             if warning:
                 self.ledger.tell("note", {"text": warning})
+
+
+def _above_m(photo: Photo) -> float:
+    """Height in m above the ground at which a photo was taken, as far as it tells."""
+    told = photo.above_takeoff_m
+    return max(told, LOWEST_M) if told is not None and told >= GROUND_M else ABOVE_M

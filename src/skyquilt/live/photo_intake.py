@@ -17,6 +17,7 @@ from skyquilt.live.settings import LiveSettings
 from skyquilt.model.bands import canonical
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.outside import open_regular, plain
+from skyquilt.photos.headers import unread_by_name
 from skyquilt.photos.left_out import AS_MANY, IS_MAP
 from skyquilt.photos.read import read_photo, rejected
 from skyquilt.video.srt import MOST_TELEMETRY_BYTES
@@ -80,6 +81,13 @@ class Intake:
         if is_clip(Path(name)):
             return self.settings.most_clip_bytes
         return MOST_TELEMETRY_BYTES if belongs_to_clip(name) else self.inbox.most_bytes
+
+    def unread(self, name: str, source: str) -> Refused | None:
+        """Refuses a file by its name, before any of it is sent: a raw picture beside each photo is
+        five times as large.
+        """
+        reason = unread_by_name(name)
+        return self.refuse(name, source, reason) if reason else None
 
     def take(self, blocks: Iterable[bytes], name: str, source: str) -> Accepted | Refused:
         """Accepts a file's bytes; when this returns `Accepted`, no crash can lose the photo.

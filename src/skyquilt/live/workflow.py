@@ -36,6 +36,7 @@ GONE_S = 120.0
 """The map ends where its folder has been gone for this time in s; a network disk comes back
 before.
 """
+INTERRUPTED = "the final map was interrupted; asked for again, it goes on where it stopped"
 STEADY_S = 5.0
 """With `finish`: if no photo arrives for this time in s, the flight is over."""
 
@@ -57,6 +58,8 @@ def iter_live(
         UsageError: a folder is missing. OutputError: the survey's folder was removed or replaced.
     """
     stop = stop or threading.Event()
+    if live.ledger.meta("finish") == "running":
+        _ended(live, "failed", INTERRUPTED)
     watches: list[Watch | UploadedClips] = [Watch(folder=f, intake=live.intake) for f in folders]
     watches.append(UploadedClips(intake=live.intake))
     busy_since = time.monotonic()
@@ -142,15 +145,17 @@ def _finished(live: LiveMap, settings: LiveSettings) -> Iterator[Event]:
         for happened in iter_finish(live.folder, settings):
             yield happened
             if isinstance(happened, Result):
-                live.ledger.put_meta("finish", "done")
-                live.ledger.tell(
-                    "finish",
-                    {"state": "done", "text": "the final map is ready, beside the live one"},
-                )
+                _ended(live, "done", "the final map is ready, beside the live one")
     except Exception as error:  # the live map goes on, whatever happens to the final one
         if not isinstance(error, SkyquiltError):
             log_error(live.folder, "the final map", error)
             error = SkyquiltError(f"{type(error).__name__}, see {ERRORS}")
-        live.ledger.put_meta("finish", "failed")
-        live.ledger.tell("finish", {"state": "failed", "text": f"no final map: {error}"})
+        _ended(live, "failed", f"no final map: {error}")
         yield Note(text=f"no final map: {error}", warning=True)
+
+
+def _ended(live: LiveMap, state: str, text: str) -> None:
+    """Records how the final map ended, unless it was asked for again meanwhile: then it is due."""
+    if live.ledger.meta("finish") == "running":
+        live.ledger.put_meta("finish", state)
+    live.ledger.tell("finish", {"state": state, "text": text})

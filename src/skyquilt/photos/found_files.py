@@ -7,16 +7,13 @@ from pathlib import Path, PurePosixPath
 
 from skyquilt.model.photo import RejectedPhoto
 from skyquilt.outside import is_folder, open_regular
+from skyquilt.photos.headers import PREVIEWS, RAW_PICTURES
 from skyquilt.photos.side_rows import sentence_of
 
 OTHER_PICTURES = (".avif", ".bmp", ".gif", ".heic", ".heif", ".jp2", ".jxl", ".webp")
 """Endings of pictures in formats that are not read."""
-_RAW = frozenset(
-    (".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".pef", ".r3d", ".raf", ".raw", ".rw2", ".srw")
-)
-"""The same of raw pictures, which cameras write beside photos."""
-_UNREAD = frozenset(OTHER_PICTURES) | _RAW | {".insp"}
-"""All of them, and pictures of two fisheyes."""
+_UNREAD = frozenset(OTHER_PICTURES) | RAW_PICTURES
+"""All endings of pictures that are not read."""
 RUN_MARKS = frozenset({"run.toml", "live.db", ".skyquilt"})
 """What the folder of an earlier run or of a live map holds, each one or another of these."""
 _DAMAGED = (
@@ -111,13 +108,13 @@ _BEGINNINGS = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n")
 
 def _misnamed_note(found: FoundFiles) -> tuple[str, ...]:
     """A sentence on photos whose names do not end as those of photos, as of recovered or downloaded
-    files; those of a photo's or clip's name (`.jpg_original`, `.THM`) are copies and previews.
+    files; those of a photo's or clip's name (`.jpg_original`) are copies, a `.THM` is a preview.
     """
     looked_at = found.lone()[:_MOST_LOOKED]
     missed = [
         name
         for name, path in looked_at
-        if PurePosixPath(name).suffix.lower() not in _UNREAD and begins_as_photo(path)
+        if PurePosixPath(name).suffix.lower() not in _UNREAD | PREVIEWS and begins_as_photo(path)
     ]
     if not missed:
         return ()

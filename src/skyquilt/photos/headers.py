@@ -311,6 +311,24 @@ _BOXES = {
 """The same of files of the ISO base media format, by their brand."""
 
 
+RAW_PICTURES = frozenset(
+    (".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".pef", ".r3d", ".raf", ".raw", ".rw2", ".srw")
+) | {".insp"}
+"""Endings of raw pictures, which cameras write beside photos, and of pictures of two fisheyes."""
+PREVIEWS = frozenset((".lrv", ".thm"))
+"""Endings of small copies of videos, and pictures of them, which cameras write beside these."""
+
+
+def unread_by_name(name: str) -> str:
+    """Why a file of this name is not read, whatever its content; empty for others."""
+    ending = Path(name).suffix.lower()
+    if ending in PREVIEWS:
+        return f"it is a camera's small copy of a video ({ending}); the video itself is read"
+    if ending in RAW_PICTURES:
+        return f"pictures of this kind ({ending}) are not read; take the JPEG that the camera wrote"
+    return ""
+
+
 HEAD_BYTES = 12
 """So many bytes at the beginning of a file tell its kind."""
 

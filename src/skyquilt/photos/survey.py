@@ -383,4 +383,9 @@ def _clocks(photos: Sequence[Photo]) -> Iterator[str]:
 
 
 def _copies(copies: int) -> tuple[str, ...]:
-    return (f"{copies} files are copies of others and were left out.",) if copies else ()
+    some = (
+        f"{copies} files are copies of others and were"
+        if copies > 1
+        else "1 file is a copy and was"
+    )
+    return (f"{some} left out.",) if copies else ()

@@ -48,6 +48,9 @@ class UploadEndpoints:
         frames become photos later.
         """
         intake = self.context.writing(request).intake
+        unread = await run_in_threadpool(intake.unread, name, source)
+        if unread is not None:
+            return _refusal(unread)
         most = intake.most_bytes(name)
         limit = f"such a file may have {most} bytes"
         _check_size(_length(request), most, limit)
@@ -89,9 +92,12 @@ class UploadEndpoints:
         metadata = request.headers.get("upload-metadata", "")
         about = metadata_of(metadata)
         name = about.get("filename") or about.get("name") or "photo"
+        source = about.get("source") or "upload"
+        unread = intake.unread(name, source)
+        if unread is not None:
+            return _refusal(unread)
         most = intake.most_bytes(name)
         _check_size(size, most, f"such a file may have {most} bytes", {"Tus-Max-Size": str(most)})
-        source = about.get("source") or "upload"
         upload = self._begun(name, source, size, client_of(request), metadata)
         at = f"{RESUMABLE}/{upload.id}"
         if self.context.guard.public_url:  # else clients find it on the host that they asked
