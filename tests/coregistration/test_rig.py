@@ -55,6 +55,44 @@ def test_too_few_and_quarrelling_pairs_are_refused():
     assert "agree on one rotation" in FindRig(free=0)(apart, B).reason
 
 
+def late_pairs(rng, delay_s, headings, flown=(0.0, -6.0, 0.0), height=60.0):
+    """Pairs over level ground of a second camera that is exposed later, on lines flown so that the
+    first camera sees the drone go at these headings.
+    """
+    found = []
+    for heading in headings:
+        velocity = cam_R_map_from_angles(heading) @ cam_R_map_from_angles(0).T @ np.array(flown)
+        px_a = rng.uniform([800, 600], [3200, 2400], (30, 2))
+        ray = rays(A, px_a)
+        ground = ray * height / ray[:, 2:]
+        px_b = project(B, (ground - delay_s * velocity) @ TRUE.T)
+        pace = velocity / np.linalg.norm(ground, axis=1, keepdims=True)
+        pair = RigPair(px_a=px_a + rng.normal(0, 4, (1, 2)), px_b=px_b, camera_a=A, pace=pace)
+        found.append(pair)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("delay_s", "headings"),
+    [(0.2, [0] * 6 + [180] * 6), (-0.12, [0] * 9 + [180] * 3), (0.8, [0, 90, 180, 270])],
+)
+def test_a_late_shutter_is_told_from_a_turned_camera(delay_s, headings):
+    """On lines flown there and back by a camera that keeps its heading, the delay turns the views
+    to either side: half of the pairs would agree on a rotation that is wrong for the others.
+    """
+    late = late_pairs(np.random.default_rng(7), delay_s, headings)
+    rig = FindRig(free=0)(late, B)
+    assert rig.delay_s == pytest.approx(delay_s, abs=0.02)
+    assert rig.agreeing == len(headings) and angle_deg(rig.b_R_a, TRUE) < 0.1
+
+
+@pytest.mark.parametrize(("delay_s", "headings"), [(0.0, [0, 180] * 5), (0.3, [0] * 10)])
+def test_no_delay_is_made_up(delay_s, headings):
+    """Nor where a rotation explains it: cameras that turn with the lines see one way of flight."""
+    rig = FindRig(free=0)(late_pairs(np.random.default_rng(8), delay_s, headings), B)
+    assert rig.delay_s == 0 and rig.agreeing == 10
+
+
 def test_the_median_of_rotations_bears_outliers():
     rng = np.random.default_rng(6)
     near = [

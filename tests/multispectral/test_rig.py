@@ -58,6 +58,31 @@ def test_bands_lie_on_each_other():
     assert found.share > 0.9 and found.off_px < 0.25
 
 
+@pytest.mark.parametrize("delay_s", [0.0, 0.2])
+def test_a_band_that_is_exposed_later_is_told_from_a_turned_one(delay_s):
+    """The camera keeps its heading: on lines flown back the delay is to the other side, 8 px of
+    ground at 60 m.
+    """
+    a, b = rig(1, *SIZE, FOCAL)
+    R, near, pairs = rotation_from_vector(a.turn), 1 / 60, []
+    for k, flown in enumerate([[1.0, -6.0, 0.0]] * 2 + [[-1.0, 6.0, 0.0]]):
+        picture, moved = texture(700, 900, seed=k), delay_s * near * np.array(flown[:2])
+        pairs.append(
+            Together(
+                a=shows(picture, a),
+                camera_a=a.camera,
+                b=shows(picture, b, negative=True, moved=moved),
+                nearness=np.full((3, 3), near),
+                velocity=R @ np.array(flown),
+            )
+        )
+    found = FindBandRig()(pairs, b.camera, 0.01)
+    assert isinstance(found, BandRig)
+    assert found.delay_s == pytest.approx(delay_s, abs=0.003)
+    assert found.share > 0.9 and found.off_px < 0.25
+    assert np.median(apart_px(found, a, b, a.camera)) < 0.1
+
+
 def test_a_camera_is_found_beside_the_other_where_the_depth_changes():
     """9 cm are 0.7 to 5 px of ground at 60 to 8 m."""
     a, b = rig(1, *SIZE, FOCAL)

@@ -101,18 +101,24 @@ def test_frames_of_other_ground_are_refused(flight, frames, output, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_damaged_frame_is_left_out(flight, frames, output, tmp_path):
-    """Its header is whole, so it is met only when its values are read."""
+def test_frames_that_are_not_drawn_are_named(flight, frames, output, tmp_path):
+    """One is damaged behind a whole header, so this is met only when its values are read; another
+    has no visual photo beside it.
+    """
     shutil.copytree(frames, tmp_path / "heat")
     bad = sorted((tmp_path / "heat").glob("*.tif"))[2]
+    tifffile.imwrite(tmp_path / "heat" / "heat_9999.tif", tifffile.imread(bad)[::-1])
     tifffile.imwrite(bad, tifffile.imread(bad), compression="zlib")
     whole = bad.read_bytes()
     bad.write_bytes(whole[:2000] + bytes(len(whole) // 2) + whole[2000 + len(whole) // 2 :])
-    *_, last = iter_thermal(flight / "photos", tmp_path / "heat", output, SETTINGS)
+    *before, last = iter_thermal(flight / "photos", tmp_path / "heat", output, SETTINGS)
     assert isinstance(last, Result)
     told = last.metrics["thermal"]
-    assert told["route"] == "rig" and told["photos_used"] == 8
-    assert list(told["photos_rejected"]) == [bad.name]
+    assert told["route"] == "rig" and told["photos_used"] == 8 and told["photos_total"] == 10
+    assert list(told["photos_rejected"]) == [bad.name, "heat_9999.tif"]
+    alone = "no visual photo was taken together with it"
+    assert told["photos_rejected"]["heat_9999.tif"] == alone
+    assert Note(text=f"heat_9999.tif is left out: {alone}") in before
 
 
 @pytest.mark.slow

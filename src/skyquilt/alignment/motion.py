@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.model.photo import Photo
+from skyquilt.model.poses import Alignment
 
 Array = NDArray[np.float64]
 Speeds = Callable[[Sequence[int], Array], Array]
@@ -61,6 +62,13 @@ def velocities(photos: Sequence[Photo], C: Array) -> Array:
         if speed == 0 or np.linalg.norm(reported) < HOVERS * speed:
             out[i] = reported
     return out
+
+
+def velocities_of(photos: Sequence[Photo], alignment: Alignment) -> dict[int, Array]:
+    """Index of each placed photo -> velocity (3,) of its camera in m/s in the map frame."""
+    placed = list(alignment.poses)
+    C = np.array([alignment.poses[i].map_C for i in placed]).reshape(-1, 3)
+    return dict(zip(placed, velocities([photos[i] for i in placed], C), strict=True))
 
 
 def speeds_of(photos: Sequence[Photo]) -> Speeds:

@@ -3,6 +3,11 @@
 Both cameras have almost the same position, so the pixels of a pair correspond by a rotation alone,
 whatever the relief of the ground. Each pair gives a rotation. The rig has a single one, so pairs
 that disagree with it are outliers.
+
+Shutters of two cameras are seldom released at once, and a drone flies some centimetres in a
+hundredth of a second. Where it flies the same way in all photos as the camera sees it, the rotation
+takes that up. Where it does not (the camera keeps its heading on all lines), rotations of pairs
+differ, each along its flight: then one delay of the second camera explains them all.
 """
 
 from collections.abc import Sequence
@@ -19,6 +24,8 @@ from skyquilt.model.camera import Camera
 from skyquilt.model.registration import RefusedRegistration
 
 Array = NDArray[np.float64]
+_DELAYS = 31
+"""Delays that are tried before the best one is refined."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -31,6 +38,28 @@ class RigPair:
     """(n, 2) px of the second's."""
     camera_a: Camera
     """Calibration of the first photo."""
+    pace: Array | None = None
+    """(n, 3) velocity of the first camera along its own axes over the distance of what each px
+    shows, 1/s; None where it is not known.
+    """
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Looks:
+    """What both cameras of a pair see, as unit vectors (n, 3) along their own axes."""
+
+    a: Array
+    """By the first one."""
+    b: Array
+    """By the second one."""
+    pace: Array
+    """(n, 3) `RigPair.pace`, 0 where it is not known."""
+
+    def late(self, delay_s: float) -> Array:
+        """(n, 3) where the second camera, exposed so much later, sees what the first one shows,
+        along the axes of the first.
+        """
+        return np.asarray(self.a - delay_s * self.pace)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -47,11 +76,15 @@ class Rig:
     """Number of pairs used."""
     pairs: int
     """Number of pairs registered."""
+    delay_s: float = 0.0
+    """How much later than the first camera the second one is exposed, s; 0 where nothing tells."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FindRig:
-    """Finds the rotation on which most pairs agree, then fits one to all of these pairs."""
+    """Finds the rotation on which most pairs agree, and the delay that makes them agree, then fits
+    one rotation to all of these pairs.
+    """
 
     free: float = 0.15
     """Share by which the second focal length may change; 0 = it is known."""
@@ -59,7 +92,13 @@ class FindRig:
     """Largest angle to the common rotation for a pair to agree."""
     minimum: int = 3
     """Fewest pairs that must agree."""
-    version: ClassVar[int] = 1
+    longest_s: float = 3.0
+    """Longest delay of either camera that is looked for, s."""
+    sure: float = 4.0
+    """A delay is taken if it lies that many standard deviations from none, by how much nearer to
+    one rotation it brings the pairs.
+    """
+    version: ClassVar[int] = 2
 
     def __call__(self, pairs: Sequence[RigPair], camera_b: Camera) -> Rig | RefusedRegistration:
         """The rig, or the reason why there is none."""
@@ -70,23 +109,43 @@ class FindRig:
             )
         if self.free > 0:
             camera_b = self._focal(pairs, camera_b)
-        own = [_rotation([p], camera_b) for p in pairs]
-        common = median_rotation(own)
-        off = np.array([angle_deg(R, common) for R in own])
-        agreeing = [p for p, o in zip(pairs, off, strict=True) if o < self.agree_deg]
+        looks = [_looks(p, camera_b) for p in pairs]
+        delay = self._delay(looks)
+        off = _apart(looks, delay)
+        agreeing = [p for p, o in zip(looks, off, strict=True) if o < self.agree_deg]
         if len(agreeing) < max(self.minimum, 0.5 * len(pairs)):
             return RefusedRegistration(
                 reason=f"{len(agreeing)} of {len(pairs)} pairs taken together agree on one rotation"
                 " of the cameras"
             )
-        R = _rotation(agreeing, camera_b)
         return Rig(
-            b_R_a=R,
+            b_R_a=_rotation(agreeing, delay),
             camera_b=camera_b,
             agreeing=len(agreeing),
             pairs=len(pairs),
             spread_deg=float(np.median(off[off < self.agree_deg])),
+            delay_s=delay,
         )
+
+    def _delay(self, looks: Sequence[_Looks]) -> float:
+        """The delay in s at which the pairs' rotations lie nearest to a common one; 0 where none
+        brings them clearly nearer. Where angles r have the density exp(-r/s) / s^2 in the plane,
+        the logarithm of the likelihood is -2 n log(mean r), and rises by half the square of the
+        number of standard deviations.
+        """
+
+        def mean_deg(delay: float) -> float:
+            return max(float(_apart(looks, delay).mean()), 1e-3)
+
+        if not any(p.pace.any() for p in looks):
+            return 0.0
+        tried = np.linspace(-self.longest_s, self.longest_s, _DELAYS)
+        near, step = float(min(tried, key=mean_deg)), float(tried[1] - tried[0])
+        best = minimize_scalar(
+            mean_deg, bounds=(near - step, near + step), method="bounded", options={"xatol": 1e-3}
+        ).x
+        gain = 2 * len(looks) * np.log(mean_deg(0.0) / mean_deg(float(best)))
+        return float(best) if gain > self.sure**2 / 2 else 0.0
 
     def _focal(self, pairs: Sequence[RigPair], camera_b: Camera) -> Camera:
         """The camera with the focal length that minimises the median misfit of directions over the
@@ -109,10 +168,21 @@ def _unit(camera: Camera, px: Array) -> Array:
     return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
 
 
-def _rotation(pairs: Sequence[RigPair], camera_b: Camera) -> Array:
-    a = np.concatenate([_unit(p.camera_a, p.px_a) for p in pairs])
-    b = np.concatenate([_unit(camera_b, p.px_b) for p in pairs])
-    return turning(a, b)
+def _looks(pair: RigPair, camera_b: Camera) -> _Looks:
+    a, b = _unit(pair.camera_a, pair.px_a), _unit(camera_b, pair.px_b)
+    return _Looks(a=a, b=b, pace=np.zeros_like(a) if pair.pace is None else pair.pace)
+
+
+def _apart(looks: Sequence[_Looks], delay_s: float) -> Array:
+    """(n,) angles in degrees between the rotations of pairs and what most of them agree on."""
+    own = [_rotation([p], delay_s) for p in looks]
+    common = median_rotation(own)
+    return np.array([angle_deg(R, common) for R in own])
+
+
+def _rotation(looks: Sequence[_Looks], delay_s: float) -> Array:
+    a = np.concatenate([p.late(delay_s) for p in looks])
+    return turning(a, np.concatenate([p.b for p in looks]))
 
 
 def _misfit(pair: RigPair, camera_b: Camera) -> float:

@@ -42,6 +42,8 @@ class Together:
     """(r, c) 1 over the depth in m of the ground along the axis of the map's camera, at places
     evenly distributed from corner to corner of its photo; 0 for ground that is infinitely far.
     """
+    velocity: Array = field(default_factory=lambda: np.zeros(3))
+    """(3,) of the map's camera along its own axes, m/s; 0 where it is not known."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -54,6 +56,8 @@ class Beside:
     """(2,) where it is, m along the columns and the rows of the map's photos."""
     camera: Camera
     """Its lens."""
+    delay_s: float = 0.0
+    """How much later it is exposed, s."""
 
     @property
     def R(self) -> Array:
@@ -64,13 +68,17 @@ class Beside:
         """Its lens on a photo reduced to this shape."""
         return self.camera.reduced(shape[1], shape[0])
 
-    def sees(self, ray_a: Array, nearness: Array) -> Array:
-        """Its pixels (n, 2) of what lies on rays (n, 3) of the map's camera, at 1 over a depth."""
-        return np.asarray(project(self.camera, (ray_a - self._moved(nearness)) @ self.R.T))
+    def sees(self, ray_a: Array, nearness: Array, velocity: Array) -> Array:
+        """Its pixels (n, 2) of what lies on rays (n, 3) of the map's camera, at 1 over a depth;
+        `velocity` (n, 3) of the latter.
+        """
+        moved = self._moved(nearness, velocity)
+        return np.asarray(project(self.camera, (ray_a - moved) @ self.R.T))
 
-    def _moved(self, nearness: Array) -> Array:
+    def _moved(self, nearness: Array, velocity: Array) -> Array:
         """(n, 3) by how much the rays to a place differ."""
-        return np.outer(nearness, [*self.place, 0.0])
+        place = np.array([*self.place, 0.0]) + self.delay_s * velocity
+        return np.asarray(nearness[:, None] * place)
 
     def in_photo(self, px: Array, small: Camera, pair: Together) -> tuple[Array, Array]:
         """Where the map's photo shows pixels (n, 2) of this camera, whose lens is `small` on a
@@ -79,7 +87,7 @@ class Beside:
         ray = rays(small, px) @ self.R
         ray = ray / ray[:, 2:]
         near = _at(pair, project(pair.camera_a, ray))
-        return np.asarray(project(pair.camera_a, ray + self._moved(near))), near
+        return np.asarray(project(pair.camera_a, ray + self._moved(near, pair.velocity))), near
 
 
 def turned(pairs: Sequence[Together], there: Beside) -> Beside:

@@ -54,6 +54,8 @@ class PlacedBand:
     rigs: dict[int, BandRig] = field(default_factory=dict)
     """Its camera beside that of the map's photo, by the latter's index: one for all, unless files
     are of several cameras; empty where the map's photos are its files."""
+    velocities: dict[int, NDArray[np.float64]] = field(default_factory=dict)
+    """Velocity (3,) of the map's camera in m/s in the map frame, by the same index."""
     saturated: float = 0.0
     """Share of saturated pixels in its files."""
     detail: float | None = None
@@ -70,7 +72,7 @@ def aligned_band(band: PlacedBand, placed: Alignment) -> Alignment:
     of_photo = [i for i in band.of_photo if i in placed.poses]
     if not band.rigs:
         return replace(placed, poses={i: placed.poses[i] for i in of_photo})
-    poses = {i: _beside(placed.poses[i], band.rigs[i]) for i in of_photo}
+    poses = {i: _beside(placed.poses[i], band.rigs[i], band.velocities[i]) for i in of_photo}
     # by both cameras: a lens takes up what that of the map's photo leaves out
     name = {id(rig): f"{band.files.name} {n}" for n, rig in enumerate(band.rigs.values())}
     camera_of = {i: name[id(band.rigs[i])] for i in poses}
@@ -86,9 +88,12 @@ def aligned_band(band: PlacedBand, placed: Alignment) -> Alignment:
     )
 
 
-def _beside(pose: Pose, rig: BandRig) -> Pose:
-    """The pose of the camera of a band when the map's photo had this one."""
-    return Pose(cam_R_map=rig.b_R_a @ pose.cam_R_map, map_C=pose.map_C + rig.a_t_b @ pose.cam_R_map)
+def _beside(pose: Pose, rig: BandRig, velocity: NDArray[np.float64]) -> Pose:
+    """The pose of the camera of a band, exposed when the rig has it, when the map's photo had this
+    one.
+    """
+    moved = rig.a_t_b @ pose.cam_R_map + rig.delay_s * velocity
+    return Pose(cam_R_map=rig.b_R_a @ pose.cam_R_map, map_C=pose.map_C + moved)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -13,7 +13,8 @@ from skyquilt.model.photo import RejectedPhoto
 from skyquilt.multispectral.composite import INFRARED, composed, ends_of, reduced
 from skyquilt.multispectral.draw import BANDS_FILE, PlacedBand
 from skyquilt.multispectral.indices import INDICES, Index, indices_of
-from skyquilt.multispectral.placing import Placing, left_out
+from skyquilt.multispectral.placing import Placing
+from skyquilt.photos.left_out import told_left_out
 from skyquilt.raster.colours import coloured
 from skyquilt.report.numbers import DASH, fixed, number, plain
 from skyquilt.report.page import add_section
@@ -77,13 +78,14 @@ def _figures(band: PlacedBand) -> dict[str, Any]:
         "cameras": max(len(rigs), 1),
     }
     if not rigs:
-        of_camera = ("band_R_map_photo", "beside_m", "focal_px", "off_px", "agree")
+        of_camera = ("band_R_map_photo", "beside_m", "delay_s", "focal_px", "off_px", "agree")
         return saved | dict.fromkeys(of_camera)
     off = max(r.off_px for r in rigs)
     return {
         **saved,
         "band_R_map_photo": rigs[0].b_R_a.tolist(),
         "beside_m": rigs[0].a_t_b.round(4).tolist(),
+        "delay_s": round(rigs[0].delay_s, 3),
         "focal_px": round(rigs[0].camera.focal, 2),
         "off_px": round(off, 3) if np.isfinite(off) else None,
         "agree": round(min(r.share for r in rigs), 3),
@@ -139,7 +141,7 @@ def bands_section(
     blocks += [picture(*p) for p in pictures]
     said = [f"The band {n} is left out: {why}." for n, why in record["refused"].items()]
     files = [RejectedPhoto(name=n, reason=why) for n, why in record["photos_rejected"].items()]
-    said += [f"{sentence}." for sentence in left_out(files)]
+    said += [f"{sentence}." for sentence in told_left_out(files)]
     said += record["notes"]
     if said:
         blocks.append(Sentences(items=tuple(said)))

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.motion import velocities_of
 from skyquilt.engine.clock import Steps
 from skyquilt.engine.workers import Workers
 from skyquilt.imaging.grey import shrink, to_grey8
@@ -36,6 +37,8 @@ from skyquilt.multispectral.rig import BandRig, FindBandRig
 from skyquilt.photos.pixels import read_color
 from skyquilt.workflows.flow import AlignedPhotos, Scene
 
+Velocity = NDArray[np.float64]
+"""(3,) in m/s in the map frame."""
 MOST_PAIRS = 6
 """Captures from which the camera of a band is found, distributed over the flight; each takes a
 quarter of a second.
@@ -82,6 +85,7 @@ def place_bands(scene: Scene, others: Sequence[Photo], workers: Workers) -> Step
     recorded = yield from _recorded([*own, *found], workers)
     placed = [PlacedBand(files=b, of_photo=_own_files(aligned, b)) for b in own]
     known_tags = {p.name: t for b in own for p, t in zip(b.photos, b.tags, strict=True)}
+    velocities = velocities_of(aligned.photos, aligned.alignment)
     captures = [(known_tags.get(p.name) or tags_of(p)).capture for p in aligned.photos]
     refused: dict[str, str] = {}
     lost: list[RejectedPhoto] = []
@@ -92,7 +96,7 @@ def place_bands(scene: Scene, others: Sequence[Photo], workers: Workers) -> Step
         band = band.only([j for j, p in enumerate(band.photos) if p.name not in useless])
         of_photo = captured_together(aligned.photos, captures, band)
         of_photo = {i: j for i, j in of_photo.items() if i in poses}
-        rigs = _rigs(scene, band, of_photo)
+        rigs = _rigs(scene, band, of_photo, velocities)
         known = {i: rig for i, rig in rigs.items() if isinstance(rig, BandRig)}
         reasons = {i: rig.reason for i, rig in rigs.items() if not isinstance(rig, BandRig)}
         if known:
@@ -101,7 +105,9 @@ def place_bands(scene: Scene, others: Sequence[Photo], workers: Workers) -> Step
                 for i, why in reasons.items()
             ]
             of_photo = {i: of_photo[i] for i in known}
-            placed.append(PlacedBand(files=band, of_photo=of_photo, rigs=known))
+            placed.append(
+                PlacedBand(files=band, of_photo=of_photo, rigs=known, velocities=velocities)
+            )
         else:
             why = f"none of its files can be used: {next(iter(useless.values()), '')}"
             refused[band.name] = next(iter(reasons.values()), why)
@@ -129,19 +135,6 @@ def place_bands(scene: Scene, others: Sequence[Photo], workers: Workers) -> Step
     )
 
 
-def left_out(lost: Sequence[RejectedPhoto]) -> list[str]:
-    """A sentence for each reason why files are left out."""
-    alike: dict[str, list[str]] = {}
-    for photo in lost:
-        alike.setdefault(photo.reason, []).append(photo.name)
-    return [
-        f"{names[0]} is left out: {reason}"
-        if len(names) == 1
-        else f"{len(names)} files are left out, {names[0]} for one: {reason}"
-        for reason, names in alike.items()
-    ]
-
-
 def _recorded(bands: Sequence[BandFiles], workers: Workers) -> Steps[dict[str, Recorded]]:
     """What each file recorded, by its name."""
     items = [item for b in bands for item in zip(b.photos, b.converts, strict=True)]
@@ -159,7 +152,7 @@ def _own_files(aligned: AlignedPhotos, band: BandFiles) -> dict[int, int]:
 
 
 def _rigs(
-    scene: Scene, band: BandFiles, of_photo: dict[int, int]
+    scene: Scene, band: BandFiles, of_photo: dict[int, int], velocities: dict[int, Velocity]
 ) -> dict[int, BandRig | RefusedRegistration]:
     """The camera of a band beside that of each of the map's photos (index)."""
     aligned = scene.aligned
@@ -168,11 +161,14 @@ def _rigs(
         cameras = aligned.photos[i].camera_key, band.photos[j].camera_key
         alike.setdefault(cameras, {})[i] = j
     if not alike:  # says that none were taken together
-        return {-1: _rig(scene, band, {})}
-    return {i: rig for part in alike.values() for rig in [_rig(scene, band, part)] for i in part}
+        return {-1: _rig(scene, band, {}, velocities)}
+    rigs = ((part, _rig(scene, band, part, velocities)) for part in alike.values())
+    return {i: rig for part, rig in rigs for i in part}
 
 
-def _rig(scene: Scene, band: BandFiles, of_photo: dict[int, int]) -> BandRig | RefusedRegistration:
+def _rig(
+    scene: Scene, band: BandFiles, of_photo: dict[int, int], velocities: dict[int, Velocity]
+) -> BandRig | RefusedRegistration:
     """One camera of a band beside one of the map's photos."""
     aligned, pairs = scene.aligned, sorted(of_photo.items())
     alignment = aligned.alignment
@@ -182,7 +178,9 @@ def _rig(scene: Scene, band: BandFiles, of_photo: dict[int, int]) -> BandRig | R
         )
     pairs = _far(scene, pairs)
     asked = [pairs[k] for k in evenly(len(pairs), MOST_PAIRS)]
-    seen = [t for i, j in asked if (t := _together(scene, i, band.photos[j])) is not None]
+    seen = [
+        t for i, j in asked if (t := _together(scene, i, band.photos[j], velocities[i])) is not None
+    ]
     if not pairs:
         return FindBandRig()(seen, Camera.ideal(width=1, height=1, focal=1.0), 0.0)
     (i, j), *_ = pairs
@@ -214,7 +212,7 @@ def _far(scene: Scene, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
     return [pair for pair, used in zip(pairs, far, strict=True) if used]
 
 
-def _together(scene: Scene, index: int, other: Photo) -> Together | None:
+def _together(scene: Scene, index: int, other: Photo, velocity: Velocity) -> Together | None:
     """Pictures of one capture; None where the band's file cannot be read."""
     aligned = scene.aligned
     try:
@@ -227,6 +225,7 @@ def _together(scene: Scene, index: int, other: Photo) -> Together | None:
         camera_a=camera,
         b=shrink(grey, LONGEST)[0],
         nearness=_nearness(scene, index),
+        velocity=aligned.alignment.poses[index].cam_R_map @ velocity,
     )
 
 

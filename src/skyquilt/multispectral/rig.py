@@ -53,6 +53,8 @@ class BandRig:
     """(3,) where the band's camera is, m along the axes of that of the map's photos."""
     camera: Camera
     """The calibration of the band's camera."""
+    delay_s: float
+    """How much later than the map's photos it is exposed, s; 0 where nothing tells."""
     pairs: int
     """Pairs of photos from which it was found."""
     patches: int
@@ -75,6 +77,8 @@ class _Matched:
     """(n, 2) px of the band at full size."""
     nearness: Array
     """(n,) 1 over their depth in m."""
+    velocity: Array
+    """(n, 3) of the map's camera along its own axes, m/s."""
     pair: NDArray[np.intp]
     """(n,) pair that each was matched in."""
     camera_a: Camera
@@ -82,7 +86,9 @@ class _Matched:
 
     def only(self, kept: NDArray[np.bool_]) -> "_Matched":
         """These (n,) of them."""
-        parts = {n: getattr(self, n)[kept] for n in ("px_a", "px_b", "nearness", "pair")}
+        parts = {
+            n: getattr(self, n)[kept] for n in ("px_a", "px_b", "nearness", "velocity", "pair")
+        }
         return replace(self, **parts)
 
 
@@ -115,7 +121,13 @@ class FindBandRig:
     better is looked for."""
     sigma_m: float = 0.05
     """Standard deviation of the distance in m between two cameras along either axis."""
-    version: ClassVar[int] = 4
+    sigma_s: float = 0.5
+    """Standard deviation of the delay in s between two cameras."""
+    other_way: float = 0.3
+    """Share of the largest velocity by which that of a pair must differ from the mean of all along
+    the axes of the camera for a delay to be told from a rotation.
+    """
+    version: ClassVar[int] = 5
 
     def __call__(
         self, pairs: Sequence[Together], camera_b: Camera, sigma_focal: float
@@ -150,11 +162,20 @@ class FindBandRig:
             b_R_a=there.R,
             a_t_b=np.array([*there.place, 0.0]),
             camera=there.camera,
+            delay_s=there.delay_s,
             pairs=len(pairs),
             patches=int(agree.sum()),
             share=float(agree.mean()),
             off_px=self._kept_out(found, there, camera_b, sigma_focal),
         )
+
+    def _ways_differ(self, pairs: Sequence[Together]) -> bool:
+        """Whether the map's camera was flown in several ways along its own axes (it does not turn
+        with the lines), so that a delay is not the same as a rotation.
+        """
+        v = np.array([pair.velocity for pair in pairs])
+        apart = np.linalg.norm(v - v.mean(0), axis=1)
+        return bool(apart.max() > self.other_way * np.linalg.norm(v, axis=1).max())
 
     def _from(
         self,
@@ -167,15 +188,16 @@ class FindBandRig:
         they are off in px of a reduced photo; None where none were matched. `fields`: those of the
         band's photo of a pair, reduced to a side.
         """
-        told = there.camera
+        told, late = there.camera, self._ways_differ(pairs)
         rounds = zip(self.sides, self.reach, self.apart, strict=True)
         for step, (side, reach, apart) in enumerate(rounds):
-            few = evenly(len(pairs), max(self.minimum, ceil(self.share[step] * len(pairs))))
+            share = 1.0 if late else self.share[step]  # of all ways that are flown
+            few = evenly(len(pairs), max(self.minimum, ceil(share * len(pairs))))
             seen = [(k, pairs[k], fields(k, side)) for k in few]
             found = self._matched(seen, there, reach, apart)
             if not len(found.px_a):
                 return None
-            there = self._fitted(found, there, told, step, sigma_focal)
+            there = self._fitted(found, there, told, step, sigma_focal, late)
         off = _off(found, there) / _scale(told, self.sides[-1])
         return there, found, np.nan_to_num(off, nan=np.inf)
 
@@ -197,36 +219,54 @@ class FindBandRig:
             full = there.camera.height, there.camera.width
             px_b = full_px(px + shift, b.shape, full)
             px_a, near = there.in_photo(px, small, pair)
-            rows.append((px_a, px_b, near, np.full(len(px_a), k, np.intp)))
-        px_a, px_b, near, pair_ = (np.concatenate([row[n] for row in rows]) for n in range(4))
+            velocity = np.broadcast_to(pair.velocity, (len(px_a), 3))
+            rows.append((px_a, px_b, near, velocity, np.full(len(px_a), k, np.intp)))
+        px_a, px_b, near, velocity, pair_ = (
+            np.concatenate([row[n] for row in rows]) for n in range(5)
+        )
         return _Matched(
-            px_a=px_a, px_b=px_b, nearness=near, pair=pair_, camera_a=pairs[0][1].camera_a
+            px_a=px_a,
+            px_b=px_b,
+            nearness=near,
+            velocity=velocity,
+            pair=pair_,
+            camera_a=pairs[0][1].camera_a,
         )
 
     def _fitted(
-        self, found: _Matched, start: Beside, told: Camera, step: int, sigma_focal: float
+        self,
+        found: _Matched,
+        start: Beside,
+        told: Camera,
+        step: int,
+        sigma_focal: float,
+        late: bool,
     ) -> Beside:
-        """The camera that fits best in a round."""
+        """The camera that fits best in a round; `late`: and its delay."""
         free = _FREE[: _OF_ROUND[step]]
         sigma = self.scatter_px * _scale(told, self.sides[step])
         spread = _deviations(told, sigma_focal)
         ray_a = rays(found.camera_a, found.px_a)
 
         def camera(x: Array) -> Beside:
-            changed: dict[str, Any] = dict(zip(free, map(float, x[5:]), strict=True))
+            changed: dict[str, Any] = dict(zip(free, map(float, x[6:]), strict=True))
             lens = replace(start.camera, **changed)
-            return Beside(turn=x[:3], place=x[3:5], camera=lens)
+            delay = float(x[5]) if late else 0.0
+            return Beside(turn=x[:3], place=x[3:5], camera=lens, delay_s=delay)
 
         def misfit(x: Array) -> Array:
             # what is far off counts like what is three deviations off
-            off = np.nan_to_num(camera(x).sees(ray_a, found.nearness) - found.px_b, nan=1e3) / sigma
+            px_b = camera(x).sees(ray_a, found.nearness, found.velocity)
+            off = np.nan_to_num(px_b - found.px_b, nan=1e3) / sigma
             length = np.linalg.norm(off, axis=1, keepdims=True)
             weight = np.sqrt(np.log1p((length / 2) ** 2) / np.maximum((length / 2) ** 2, 1e-12))
-            prior = [(x[5 + k] - getattr(told, n)) / spread[n] for k, n in enumerate(free)]
-            return np.concatenate([(off * weight).ravel(), x[3:5] / self.sigma_m, prior])
+            prior = [(x[6 + k] - getattr(told, n)) / spread[n] for k, n in enumerate(free)]
+            beside = [*x[3:5] / self.sigma_m, x[5] / self.sigma_s]
+            return np.concatenate([(off * weight).ravel(), beside, prior])
 
-        first = [*start.turn, *start.place, *(getattr(start.camera, n) for n in free)]
-        unit = [1e-3] * 3 + [self.sigma_m] * 2 + [spread[n] for n in free]
+        lens = [getattr(start.camera, n) for n in free]
+        first = [*start.turn, *start.place, start.delay_s, *lens]
+        unit = [1e-3] * 3 + [self.sigma_m] * 2 + [self.sigma_s] + [spread[n] for n in free]
         best = least_squares(misfit, np.array(first), x_scale=unit, method="trf", max_nfev=60).x
         return camera(np.asarray(best))
 
@@ -237,7 +277,8 @@ class FindBandRig:
             part, rest = (found.only(k) for k in (found.pair % 2 == half, found.pair % 2 != half))
             if len(part.px_a) and len(rest.px_a):
                 step = len(_OF_ROUND) - 1
-                off.append(_off(part, self._fitted(rest, there, told, step, sigma_focal)))
+                late = there.delay_s != 0
+                off.append(_off(part, self._fitted(rest, there, told, step, sigma_focal, late)))
         return float(np.median(np.concatenate(off))) if off else float("nan")
 
 
@@ -289,5 +330,5 @@ def _shifts(a: Orientation, b: Orientation, reach: int, apart: float) -> tuple[A
 
 def _off(found: _Matched, there: Beside) -> Array:
     """(n,) distance in px of the band between places and where a camera has them."""
-    px = there.sees(rays(found.camera_a, found.px_a), found.nearness)
+    px = there.sees(rays(found.camera_a, found.px_a), found.nearness, found.velocity)
     return np.asarray(np.linalg.norm(px - found.px_b, axis=1))

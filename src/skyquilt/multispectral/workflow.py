@@ -24,11 +24,12 @@ from skyquilt.multispectral.draw import BANDS_FILE, BandsDrawing, PlacedBand
 from skyquilt.multispectral.indices import indices_of
 from skyquilt.multispectral.page import band_figures, write_section
 from skyquilt.multispectral.panels import by_panels
-from skyquilt.multispectral.placing import Placing, left_out, place_bands
+from skyquilt.multispectral.placing import Placing, place_bands
 from skyquilt.multispectral.reflectance import Kind
 from skyquilt.multispectral.rig import FindBandRig
 from skyquilt.outside import remove_file
 from skyquilt.photos.headers import content_digest
+from skyquilt.photos.left_out import told_left_out
 from skyquilt.photos.read import ReadFiles
 from skyquilt.settings import MosaicSettings
 from skyquilt.typed import as_path, instance
@@ -109,7 +110,7 @@ def _bands(made: FinishedMap, others: Sequence[Photo]) -> Generator[Event, None,
         return
     placing = place_bands(scene, others, clock.workers)
     placed = yield from clock.stage("rig", placing, keeps=False)
-    yield from (Note(text=t, warning=True) for t in (*placed.notes, *left_out(placed.lost)))
+    yield from (Note(text=t, warning=True) for t in (*placed.notes, *told_left_out(placed.lost)))
     yield from [placed.panel] if placed.panel else []
     bands, lost, made_files = yield from _drawn(made, scene, placed, clock, key)
     for name in {*ADDED} - {*made_files, THERMAL_FILE}:  # of an earlier run with other bands

@@ -288,3 +288,16 @@ def _usual(photos: Sequence[Photo]) -> str:
         return ""
     bands, rank = bands_of(photos), {name: k for k, name in enumerate(PREFERRED)}
     return min(bands, key=lambda name: (-bands[name], rank.get(name, len(rank)), name))
+
+
+def told_left_out(lost: Sequence[RejectedPhoto]) -> list[str]:
+    """A sentence for each reason why files are left out."""
+    alike: dict[str, list[str]] = {}
+    for photo in lost:
+        alike.setdefault(photo.reason, []).append(photo.name)
+    return [
+        f"{names[0]} is left out: {reason}"
+        if len(names) == 1
+        else f"{len(names)} files are left out, {names[0]} for one: {reason}"
+        for reason, names in alike.items()
+    ]

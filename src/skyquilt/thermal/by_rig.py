@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from skyquilt.alignment.motion import velocities_of
 from skyquilt.coregistration.pictures import guess_of, open_picture
 from skyquilt.coregistration.rig import FindRig, Rig, RigPair
 from skyquilt.coregistration.workflow import outcome_of
@@ -14,7 +16,8 @@ from skyquilt.errors import PhotoFailedError
 from skyquilt.geometry.transforms import transfer
 from skyquilt.imaging.grey import shrink
 from skyquilt.imaging.nodes import View
-from skyquilt.imaging.views import make_views
+from skyquilt.imaging.views import make_views, on_ground
+from skyquilt.model.event import Note
 from skyquilt.model.photo import Photo, RejectedPhoto, Survey
 from skyquilt.model.poses import Alignment, Pose, no_ties
 from skyquilt.model.raster import Window
@@ -25,6 +28,7 @@ from skyquilt.ortho.compose import Composer
 from skyquilt.ortho.exposure import NEUTRAL, Exposure
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.radiometry import DriftMethod, balances_drift, drift_of, value_tags
+from skyquilt.photos.left_out import told_left_out
 from skyquilt.photos.pixels import read_color
 from skyquilt.photos.read import rejected
 from skyquilt.photos.together import taken_together
@@ -39,6 +43,8 @@ seconds.
 """
 KNOWN_FOCAL = 0.01
 """The thermal focal length is not estimated if its relative standard deviation is below this."""
+_AGREE = 0.75
+"""Share of registered pairs below which it is told that others do not agree with them."""
 _GRID = 6
 """Points per side of the grid from which the rotation of a registered pair is computed."""
 
@@ -54,7 +60,7 @@ class Rigged:
     alignment: Alignment
     """Poses of those that can be drawn in the visual map's frame."""
     rejected: tuple[RejectedPhoto, ...] = ()
-    """Thermal photos that were taken together with a visual one, but cannot be decoded."""
+    """Those that cannot be decoded, or were not taken together with a placed visual one."""
 
     def without(self, error: PhotoFailedError) -> "Rigged":
         """The others, without the photo on which drawing failed."""
@@ -75,7 +81,9 @@ class Rigged:
 def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistration:
     """Places thermal photos by visual poses, or gives the reason why this is not possible."""
     visual, placed = scene.aligned.photos, scene.aligned.alignment
-    together = [(i, j) for i, j in taken_together(visual, thermal) if i in placed.poses]
+    paired = taken_together(visual, thermal)
+    together = [(i, j) for i, j in paired if i in placed.poses]
+    alone = _alone(visual, thermal, paired, placed)
     bad = {j: r for _, j in together if (r := _undecodable(thermal[j])) is not None}
     pairs = [(i, j) for i, j in together if j not in bad]
     if len(pairs) < FindRig.minimum:
@@ -95,11 +103,14 @@ def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistrati
             reason=f"the thermal photos are from {len(kinds)} cameras or formats"
         )
     asked = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, MOST_PAIRS).astype(int))]
-    seen = [p for i, j in asked if (p := _registered(scene, i, thermal[j])) is not None]
+    velocity = velocities_of(visual, placed)
+    seen = [
+        p for i, j in asked if (p := _registered(scene, i, thermal[j], velocity[i])) is not None
+    ]
     rig = FindRig(free=_freedom(first))(seen, first.lens)
     if isinstance(rig, RefusedRegistration):
         return rig
-    poses = {k: _turned(placed.poses[i], rig) for k, (i, _) in enumerate(pairs)}
+    poses = {k: _turned(placed.poses[i], velocity[i], rig) for k, (i, _) in enumerate(pairs)}
     alignment = Alignment(
         method="rig",
         why="both cameras were on the same drone",
@@ -111,7 +122,27 @@ def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistrati
         ties=no_ties(),
     )
     photos = tuple(thermal[j] for _, j in pairs)
-    return Rigged(rig=rig, photos=photos, alignment=alignment, rejected=tuple(bad.values()))
+    return Rigged(rig=rig, photos=photos, alignment=alignment, rejected=(*bad.values(), *alone))
+
+
+def _alone(
+    visual: Sequence[Photo],
+    thermal: Sequence[Photo],
+    paired: Sequence[tuple[int, int]],
+    placed: Alignment,
+) -> list[RejectedPhoto]:
+    """The thermal photos that no placed visual one was taken together with."""
+    beside = {j: i for i, j in paired}
+    return [
+        RejectedPhoto(
+            name=photo.name,
+            reason="the visual photo that was taken together with it is not placed"
+            if j in beside
+            else "no visual photo was taken together with it",
+        )
+        for j, photo in enumerate(thermal)
+        if beside.get(j) not in placed.poses
+    ]
 
 
 def _undecodable(photo: Photo) -> RejectedPhoto | None:
@@ -132,11 +163,13 @@ def _freedom(photo: Photo) -> float:
     return float(min(3 * photo.focal.sigma_px / photo.focal.px, 1.0))
 
 
-def _turned(pose: Pose, rig: Rig) -> Pose:
-    return Pose(cam_R_map=rig.b_R_a @ pose.cam_R_map, map_C=pose.map_C)
+def _turned(pose: Pose, velocity: NDArray[np.float64], rig: Rig) -> Pose:
+    return Pose(cam_R_map=rig.b_R_a @ pose.cam_R_map, map_C=pose.map_C + rig.delay_s * velocity)
 
 
-def _registered(scene: Scene, index: int, thermal: Photo) -> RigPair | None:
+def _registered(
+    scene: Scene, index: int, thermal: Photo, velocity: NDArray[np.float64]
+) -> RigPair | None:
     """Correspondences over the overlap of two photos taken at the same time; None if they cannot be
     registered.
     """
@@ -154,8 +187,15 @@ def _registered(scene: Scene, index: int, thermal: Photo) -> RigPair | None:
     inside = ((px_a > 0) & (px_a < [a.width - 1, a.height - 1])).all(1)
     if inside.sum() < _GRID:
         return None
-    camera = scene.aligned.alignment.camera(index)
-    return RigPair(px_a=px_a[inside], px_b=px_b[inside], camera_a=camera)
+    camera, pose = scene.aligned.alignment.camera(index), scene.aligned.alignment.poses[index]
+    view = View(photo=index, camera=camera, pose=pose, footprint=np.zeros((0, 2)))
+    away = np.linalg.norm(on_ground(view, px_a[inside], scene.ground.surface) - pose.map_C, axis=1)
+    return RigPair(
+        px_a=px_a[inside],
+        px_b=px_b[inside],
+        camera_a=camera,
+        pace=(pose.cam_R_map @ velocity) / away[:, None],
+    )
 
 
 def drift_of_rigged(
@@ -215,6 +255,34 @@ def draw_rigged(
             writer.write_block(block, composed.pixels, composed.photo >= 0)
 
 
+def rig_notes(found: Rigged) -> list[Note]:
+    """What is told of how both cameras go together, and of photos that are not drawn."""
+    rig, drawn = found.rig, len(found.alignment.poses)
+    few = len(found.rejected) > drawn
+    notes = [Note(text=text, warning=few) for text in told_left_out(found.rejected)]
+    if few:
+        text = (
+            f"only {drawn} of {drawn + len(found.rejected)} thermal photos are drawn, by the poses"
+            " of the visual ones; --thermal-route maps uses the others, too"
+        )
+        notes.append(Note(text=text, warning=True))
+    if rig.delay_s:
+        when = f"{abs(rig.delay_s):.2f} s {'later' if rig.delay_s > 0 else 'earlier'}"
+        text = (
+            f"thermal photos were taken {when} than the visual ones beside them, by what both show;"
+            " they are drawn from where the drone was then"
+        )
+        notes.append(Note(text=text))
+    if rig.agreeing < _AGREE * rig.pairs:
+        text = (
+            f"{rig.pairs - rig.agreeing} of {rig.pairs} pairs of photos taken together show the"
+            " thermal camera turned otherwise than the others do: such photos lie beside their"
+            " place in thermal.tif; --thermal-route maps registers the whole map instead"
+        )
+        notes.append(Note(text=text, warning=True))
+    return notes
+
+
 def rig_figures(found: Rigged, thermal: Survey) -> dict[str, Any]:
     """The entry `thermal` of metrics.json."""
     rig, first = found.rig, found.photos[0]
@@ -230,6 +298,7 @@ def rig_figures(found: Rigged, thermal: Survey) -> dict[str, Any]:
             "pairs_agreeing": rig.agreeing,
             "spread_deg": round(rig.spread_deg, 4),
             "focal_px": round(rig.camera_b.focal, 2),
+            "delay_s": round(rig.delay_s, 3),
         },
         "thermal_R_visual": rig.b_R_a.tolist(),
         "photos_used": len(found.alignment.poses),

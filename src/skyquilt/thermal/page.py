@@ -87,6 +87,7 @@ _EVIDENCE = {
     "pairs_registered": "of these, pairs that could be registered",
     "pairs_by_colour": "of these, pairs refined by the visual image's colours",
     "spread_deg": "spread of the pairs' rotations, degrees",
+    "delay_s": "thermal photos taken later than visual ones by, s",
     "focal_px": "thermal focal length, px",
     "cells": "cells of heights compared",
     "residual_m": "robust standard deviation of the height differences, m",

@@ -37,7 +37,7 @@ from skyquilt.photos.together import taken_together
 from skyquilt.settings import DEFAULTS, MosaicSettings, PictureSettings
 from skyquilt.thermal.by_heights import finer
 from skyquilt.thermal.by_pairs import by_homographies, by_pairs
-from skyquilt.thermal.by_rig import draw_rigged, drift_of_rigged, rig_figures, rigged
+from skyquilt.thermal.by_rig import draw_rigged, drift_of_rigged, rig_figures, rig_notes, rigged
 from skyquilt.thermal.page import write_overlays, write_section
 from skyquilt.thermal.routes import ROUTES, Joined, as_registration, join, opened, refuse_apart
 from skyquilt.typed import as_path, instance
@@ -259,6 +259,7 @@ def _by_rig(
     found = rigged(scene, thermal.photos)
     if isinstance(found, RefusedRegistration):
         return found
+    yield from rig_notes(found)
     output, metrics = visual.result.output, visual.result.metrics
     while True:
         try:
