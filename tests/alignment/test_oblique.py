@@ -309,11 +309,38 @@ def test_photos_that_only_match_one_another_are_not_drawn_over_what_the_others_s
     done = block([*LAWN, *two], hills(3000))
     own = tuple(range(len(LAWN)))
     done = replace(done, blocks=(own, (15, 16)))
-    found = without_strange_blocks(done)
+    photos = [photo(f"{i}.jpg", key="A") for i in range(len(LAWN) + 2)]
+    found = without_strange_blocks(done, photos)
     assert found.poses.keys() == {*own, *(() if left_out else (15, 16))}
     assert found.rejected.keys() == ({15, 16} if left_out else set())
     assert any("2 photos are left out" in note for note in found.notes) == left_out
     assert set(found.ties.photo) == found.poses.keys()
+
+
+@pytest.mark.parametrize(
+    ("low_m", "high_m", "apart_m", "left_out"),
+    [
+        (0.3, 60.0, 0.4, True),  # pictures of the ground at take-off
+        (6.0, 60.0, 0.4, False),  # a hover
+        (0.3, 60.0, 15.0, False),  # a strip as high as take-off, over a valley
+        (0.3, 12.0, 0.4, False),  # a flight hardly above the ground
+        (None, 60.0, 0.4, False),
+    ],
+)
+def test_photos_taken_on_the_ground_are_left_out_whatever_their_number(
+    low_m, high_m, apart_m, left_out
+):
+    ground = [pose(90 + apart_m * k, 0, z=7.0) for k in range(10)]
+    done = block([*LAWN, *ground], hills(3000))
+    own, others = tuple(range(15)), tuple(range(15, 25))
+    done = replace(done, blocks=(own, others))
+    photos = [
+        photo(f"{i}.jpg", key="A", position=None, height_m=high_m if i in own else low_m)
+        for i in range(25)
+    ]
+    found = without_strange_blocks(done, photos)
+    assert found.rejected.keys() == (set(others) if left_out else set())
+    assert any("on the ground" in note and "15.jpg" in note for note in found.notes) == left_out
 
 
 @pytest.mark.parametrize(("level", "placed"), [(0, False), (255, False), (11, False), (90, True)])

@@ -71,6 +71,17 @@ def test_photos_are_sent_and_refusals_told(page, flight, tmp_path):
         assert page.is_hidden("#sent") and page.is_hidden("#stopsend")
         holds(page, "skyquilt.state.photos.size === 2")
         holds(page, "/last came \\d/.test(document.querySelector('#counts').textContent)")
+        # the clock was set back after the first: the last is still the one of the highest number
+        page.evaluate(
+            "[...skyquilt.state.photos.values()].reduce((a, p) => p.id < a.id ? p : a)"
+            ".received += 9e3;"
+            "document.dispatchEvent(new Event('photoslisted'))"
+        )
+        came = page.evaluate(
+            "new Date([...skyquilt.state.photos.values()].reduce((a, p) => p.id > a.id ? p : a)"
+            ".received * 1000).toLocaleTimeString()"
+        )
+        assert f"last came {came}" in page.inner_text("#counts")
         page.click("#resend")
         holds(page, f"{WORDS} === '2 of 3 sent'")
         assert page.inner_text("#unsent").count("notes.jpg") == 1

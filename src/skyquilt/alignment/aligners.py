@@ -26,6 +26,8 @@ from skyquilt.model.camera import Camera
 from skyquilt.model.features import Features
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, Pose, Prior
+from skyquilt.photos.implausible_positions import raised
+from skyquilt.photos.side_rows import sentence_of
 
 SHOWN_ALREADY = 0.8
 """Photos without links are left out where connected photos show more than this share of what they
@@ -34,6 +36,10 @@ would show, and so are small blocks where the largest one shows more of it.
 STRANGE = 0.25
 """Such blocks have fewer photos than this share of the largest one: two flights that do not look
 alike, or lines of a wide lens that overlap by far, are both worth their place.
+"""
+FLOWN_M, PLACE_M = 30.0, 10.0
+"""Photos are taken on the ground if they tell so and lie nearer together than the second, while the
+others were taken from the first or higher: a strip over a valley, as high as take-off, is longer.
 """
 NEIGHBOURS = 40
 """So many of the nearest connected photos are asked."""
@@ -59,7 +65,7 @@ class ByLinks:
 
     bundle: Bundle = field(default_factory=Bundle)
     """The adjustment."""
-    version: ClassVar[int] = 12
+    version: ClassVar[int] = 13
     needs_links: ClassVar[bool] = True
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -70,7 +76,7 @@ class ByLinks:
         """
         inputs, said = without_crowded(inputs)
         if inputs.former is not None and (grown := added(inputs, self.bundle)) is not None:
-            return without_strange_blocks(with_loose_photos(grown, inputs))
+            return without_strange_blocks(with_loose_photos(grown, inputs), inputs.photos)
         control = control_in_frame(inputs.control, inputs.photos, inputs.frame)
         found = self.bundle(
             inputs.photos,
@@ -91,7 +97,8 @@ class ByLinks:
         }
         found = without_copied_views(found, [p.name for p in inputs.photos], told, bare)
         found = replace(found, notes=(*found.notes, *said, *one_place_notes(inputs)))
-        return replace(without_strange_blocks(with_loose_photos(found, inputs)), why=REQUESTED)
+        found = without_strange_blocks(with_loose_photos(found, inputs), inputs.photos)
+        return replace(found, why=REQUESTED)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,7 +136,7 @@ class Auto:
     """For linked photos."""
     pose: ByReport
     """For photos that only have positions."""
-    version: ClassVar[int] = 12
+    version: ClassVar[int] = 13
     needs_links: ClassVar[bool] = True
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -229,27 +236,51 @@ def placed_by_metadata(
     return replace(placed, notes=(*placed.notes, *repaired.notes))
 
 
-def without_strange_blocks(found: Alignment) -> Alignment:
-    """The alignment without small blocks that no link connects with the largest one though this
-    shows the same ground. They do not look like it: photos of people or of a room before the
-    flight, or a few of another day. They would be drawn over it, as far off as positions are.
+def without_strange_blocks(found: Alignment, photos: Sequence[Photo]) -> Alignment:
+    """The alignment without blocks that no link connects with the largest one and that show
+    something else: small ones where that shows the same ground (photos of people or of a room
+    before the flight, or a few of another day), and any taken on the ground, at take-off. They
+    would be drawn over it, as far off as positions are.
     """
     first, *others = [b for b in found.blocks if len(b) > 1] or [()]
     reasons, notes = dict[int, str](), list[str]()
     for block in others:
         shown = [share_shown(found.poses[i], found.camera(i), found, first) for i in block]
-        if len(block) < STRANGE * len(first) and float(np.mean(shown)) > SHOWN_ALREADY:
+        if _grounded(found, photos, block, first):
+            why = f"not with the {len(first)} of the largest block, which were taken in the air"
+            names = sentence_of([photos[i].name for i in block])
+            what = f" They were taken on the ground ({names})."
+        elif len(block) < STRANGE * len(first) and float(np.mean(shown)) > SHOWN_ALREADY:
             why = f"not with the {len(first)} of the largest block, which show the same ground"
-            reason = f"it is linked with {len(block) - 1} other photos, but {why}"
-            reasons |= dict.fromkeys(block, reason)
-            notes.append(
-                f"{len(block)} photos are left out: they are linked with one another, but {why}."
+            what = (
                 " They show something else, or it looks different on them (another day); if they"
                 " belong to the survey, map them by themselves."
             )
+        else:
+            continue
+        reason = f"it is linked with {len(block) - 1} other photos, but {why}"
+        reasons |= dict.fromkeys(block, reason)
+        notes.append(
+            f"{len(block)} photos are left out: they are linked with one another, but {why}.{what}"
+        )
     if not reasons:
         return found
     return replace(without_photos(found, reasons), notes=(*found.notes, *notes))
+
+
+def _grounded(
+    found: Alignment, photos: Sequence[Photo], block: Sequence[int], first: Sequence[int]
+) -> bool:
+    """Whether photos that lie together tell that they were taken on the ground, and those of the
+    larger block `first` from high above.
+    """
+    heights = [photos[i].above_takeoff_m for i in block]
+    flown = [h for i in first if (h := photos[i].above_takeoff_m) is not None]
+    if None in heights or any(raised(photos[i]) for i in block) or not flown:
+        return False
+    places = np.array([found.poses[i].map_C[:2] for i in block])
+    apart = float(np.linalg.norm(places - places.mean(0), axis=1).max())
+    return apart < PLACE_M and float(np.median(flown)) >= FLOWN_M
 
 
 def with_loose_photos(alignment: Alignment, inputs: AlignmentInputs) -> Alignment:

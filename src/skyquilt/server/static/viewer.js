@@ -36,7 +36,8 @@ const otherSurvey = () => {
 // How many photos are in which state, and, while the map grows, when the last one came.
 const showCounts = () => {
   const counts = Object.entries(state.info.counts).filter(([, n]) => n).map(([k, n]) => `${n} ${k}`);
-  const came = Math.max(...[...state.photos.values()].map((p) => p.received || 0), 0);
+  // by numbers, which rise as photos come: a clock that was set back would leave a time in the future
+  const { received: came } = [...state.photos.values()].reduce((a, p) => (p.id > a.id ? p : a), { id: 0 });
   if (state.info.growing && came) counts.push(`last came ${new Date(came * 1000).toLocaleTimeString()}`);
   $("counts").textContent = counts.join(", ");
 };
