@@ -269,3 +269,15 @@ def test_rows_of_crops_tell_no_place_along_them(auto, degrees):
     )
     outcome = auto(Picture(values=a.astype(np.uint8)), Picture(values=255 - b.astype(np.uint8)))
     assert isinstance(outcome, RefusedRegistration)
+
+
+def test_faults_of_a_detector_hide_nothing(auto):
+    """Half a percent of pixels without a value, half a percent hot, a dead row."""
+    truth = turned(0.9, 20.0, SMALL, SMALL, (5.0, -4.0))
+    a, b = pair(truth, SMALL, seed=3, shape_a=SMALL)
+    chance = np.random.default_rng(2).random(b.shape)
+    frame = np.where(chance > 0.995, 382.0, 5 + b / 20)
+    frame[(chance < 0.005) | (np.arange(240) == 70)[:, None]] = np.nan
+    found = auto(Picture(values=a), Picture(values=frame.astype(np.float32), valid=b > 0))
+    assert found, found.reason
+    assert error(found.b_H_a, truth, SMALL) < 0.5

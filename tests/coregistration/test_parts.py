@@ -272,3 +272,19 @@ def test_fishers_tail_is_scipys():
             _fisher(ranks), -chi2.logsf(-2 * np.log(ranks).sum(), 2 * n) / np.log(10), rtol=1e-9
         )
     assert _fisher(np.zeros(0)) == 0.0 and _fisher(np.ones(3)) == 0.0
+
+
+def test_faults_of_single_pixels_and_lines_are_no_picture(scene):
+    """Dead pixels and lines have no value, hot and stuck ones one far off; an area without
+    measurements stays one.
+    """
+    rng = np.random.default_rng(1)
+    values = 290 + scene / 20  # 2 to 11 degrees
+    chance = rng.random(values.shape)
+    bad = (chance < 0.01) | (np.arange(480) == 200) | (np.arange(400) == 77)[:, None]
+    faulty = np.where(bad, np.where(chance < 0.005, np.nan, 655.35), values).astype(np.float32)
+    faulty[300:340, 100:160] = np.nan
+    found = usable(Picture(values=faulty))
+    assert (~found.valid).sum() == 40 * 60 and not found.valid[300:340, 100:160].any()
+    near = np.abs(found.grey - values)[found.valid]
+    assert np.mean(near > 0.5) < 0.01 and near.max() < 12

@@ -151,12 +151,17 @@ def test_the_same_command_does_nothing_or_mends(bare, output):
 def test_photos_in_colours_are_the_map_where_there_are_any(flown, bare, tmp_path):
     shutil.copytree(bare, tmp_path / "photos")
     shutil.copytree(flown / "photos", tmp_path / "photos", dirs_exist_ok=True)
-    *_, last = iter_bands(tmp_path / "photos", tmp_path / "out", SETTINGS)
+    (tmp_path / "photos" / "SIM_0009.jpg").unlink()
+    *before, last = iter_bands(tmp_path / "photos", tmp_path / "out", SETTINGS)
     with rasterio.open(tmp_path / "out" / "mosaic.tif") as source:
         assert source.count == 3
     told = last.metrics["bands"]["shown"]
     assert [b["name"] for b in told] == ["blue", "green", "red", "red edge", "nir"]
-    assert all(b["off_px"] is not None and b["photos"] == 9 for b in told)
+    assert all(b["off_px"] is not None and b["photos"] == 8 for b in told)
+    alone = last.metrics["bands"]["photos_rejected"]
+    assert len(alone) == 5 and all(name.startswith("SIM_0009_MS_") for name in alone)
+    assert set(alone.values()) == {"no photo of the map was taken together with it"}
+    assert any(isinstance(e, Note) and "5 files are left out" in e.text for e in before)
     told = judged(tmp_path / "out", flown)
     assert told["beside green, median"] < 0.25 and told["factors differ by"] < 0.03
 

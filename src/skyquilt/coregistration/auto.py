@@ -54,7 +54,7 @@ class Auto:
     """Agreement above which nothing else is tried."""
     beyond: bool = True
     """Whether everything is searched where a guess is not confirmed."""
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 5
 
     def __call__(self, a: Picture, b: Picture, guess: Guess | None = None) -> Outcome:
         """The registration of b to a, or the reason why there is none.

@@ -56,7 +56,7 @@ class RefineRegistration:
     """Largest shift (RMS) as a share of the longer side. The accepted registration is right to half
     of that.
     """
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
 
     def __call__(self, a: Picture, b: Picture, outcome: Registration) -> Registration:
         """The refined registration; unchanged if no better fit is found near it."""

@@ -86,7 +86,7 @@ class Structure:
     """Sides in px of the squares to whose areas the images are reduced: for refinement,
     decision.
     """
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
 
     def __call__(
         self, a: Picture, b: Picture, guess: Guess | None = None

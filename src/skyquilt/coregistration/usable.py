@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from skyquilt.imaging.blank import rim_labels
 from skyquilt.model.registration import Picture, RefusedRegistration
+from skyquilt.photos.detector_faults import thin
 
 SHORTEST = 48
 """Least size in px of the shorter side; in smaller images no patch could confirm a registration."""
@@ -30,6 +31,14 @@ LEAST_RANGE = 3.0
 """Least range between the 1st and 99th percentile for an image to have contrast (8-bit levels;
 counts for 16 bits).
 """
+SPECK = 5
+"""Side in px of the neighbourhood with whose median a pixel is compared."""
+FAR = 1.0
+"""How far from it, as a share of the range between the 5th and 95th percentile, a pixel of a
+measuring camera is that its detector has wrong (dead, hot).
+"""
+THICK = 4
+"""Side in px of squares without measurements that are no faults of single pixels and lines."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -56,6 +65,9 @@ def usable(picture: Picture) -> Usable:
     finite = np.isfinite(band)
     given = finite if picture.valid is None else finite & picture.valid
     grey = filled(np.where(finite, band, 0).astype(np.float32), given)
+    if picture.values.dtype != np.uint8 and given.any():
+        grey = filled(grey, ~_specks(grey, given))
+        given = given | thin(~finite, THICK)
     slack = _slack(grey[given]) if picture.values.dtype == np.uint8 and given.any() else 0.0
     valid = given & ~_bars(grey, slack) & ~_frame(grey, given, slack)
     return Usable(grey=grey, valid=valid, reason=_reason(grey, valid))
@@ -85,6 +97,15 @@ def filled(grey: NDArray[np.float32], given: NDArray[np.bool_]) -> NDArray[np.fl
     values = np.zeros(label.max() + 1, np.float32)
     values[label[given]] = grey[given]  # each given pixel has a label of its own
     return np.asarray(values[label])
+
+
+def _specks(grey: NDArray[np.float32], given: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Single pixels and lines far from all around them. A few of these in a thousand have most of
+    the contrast of a picture, and would hide what it shows.
+    """
+    low, high = np.percentile(grey[given], [5, 95])
+    off = np.abs(grey - cv2.medianBlur(grey, SPECK))
+    return np.asarray(off > FAR * max(float(high - low), 1e-6))
 
 
 def _slack(values: NDArray[np.float32]) -> float:

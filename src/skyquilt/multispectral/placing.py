@@ -4,7 +4,7 @@ capture, by the camera of the band.
 Two drones have two rigs, so a camera is found for each two cameras whose files were taken together.
 """
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,6 +34,7 @@ from skyquilt.multispectral.panels import by_panels
 from skyquilt.multispectral.recorded import Recorded, look_at
 from skyquilt.multispectral.reflectance import KINDS, Kind, common_kind
 from skyquilt.multispectral.rig import BandRig, FindBandRig
+from skyquilt.photos.left_out import without_partner
 from skyquilt.photos.pixels import read_color
 from skyquilt.workflows.flow import AlignedPhotos, Scene
 
@@ -66,7 +67,7 @@ class Placing:
     refused: dict[str, str]
     """The reason by the name of each band that is not drawn."""
     lost: list[RejectedPhoto]
-    """Files of the other bands that are not drawn, though they were taken with one that is."""
+    """Files that are not drawn of other bands that are; pictures of a panel do not count."""
     final: bool
     """Whether another run of the same files would leave out the same."""
     notes: list[str]
@@ -94,8 +95,8 @@ def place_bands(scene: Scene, others: Sequence[Photo], workers: Workers) -> Step
         useless = {p.name: why for p in band.photos if (why := recorded[p.name].reason)}
         lost += [RejectedPhoto(name=name, reason=why) for name, why in useless.items()]
         band = band.only([j for j, p in enumerate(band.photos) if p.name not in useless])
-        of_photo = captured_together(aligned.photos, captures, band)
-        of_photo = {i: j for i, j in of_photo.items() if i in poses}
+        together = captured_together(aligned.photos, captures, band)
+        of_photo = {i: j for i, j in together.items() if i in poses}
         rigs = _rigs(scene, band, of_photo, velocities)
         known = {i: rig for i, rig in rigs.items() if isinstance(rig, BandRig)}
         reasons = {i: rig.reason for i, rig in rigs.items() if not isinstance(rig, BandRig)}
@@ -104,6 +105,7 @@ def place_bands(scene: Scene, others: Sequence[Photo], workers: Workers) -> Step
                 RejectedPhoto(name=band.photos[of_photo[i]].name, reason=why)
                 for i, why in reasons.items()
             ]
+            lost += _alone(band, {j: i for i, j in together.items()}, poses)
             of_photo = {i: of_photo[i] for i in known}
             placed.append(
                 PlacedBand(files=band, of_photo=of_photo, rigs=known, velocities=velocities)
@@ -133,6 +135,15 @@ def place_bands(scene: Scene, others: Sequence[Photo], workers: Workers) -> Step
         notes=notes,
         panel=panel,
     )
+
+
+def _alone(band: BandFiles, beside: dict[int, int], placed: Container[int]) -> list[RejectedPhoto]:
+    """The files of a band that were taken with no placed photo of the map, but for pictures of a
+    panel.
+    """
+    alone = without_partner(band.photos, beside, placed, "photo of the map")
+    panels = {p.name for p, t in zip(band.photos, band.tags, strict=True) if t.panel}
+    return [r for r in alone if r.name not in panels]
 
 
 def _recorded(bands: Sequence[BandFiles], workers: Workers) -> Steps[dict[str, Recorded]]:

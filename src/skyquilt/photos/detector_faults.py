@@ -111,7 +111,7 @@ class FindFaults:
             before, bad = bad, void | self._beside(whole, bad)
             if np.array_equal(before, bad):
                 break
-        bad = self._thin(bad)
+        bad = thin(bad, self.thick)
         return bad if bad.mean() <= self.most else np.zeros_like(bad)
 
     def _beside(self, whole: NDArray[np.float32], bad: Mask) -> Mask:
@@ -141,12 +141,6 @@ class FindFaults:
         far = [np.abs(o) > self.outlying * s for o, s in zip((first, second), scales, strict=True)]
         same = np.maximum((off > 0).mean(0), (off < 0).mean(0)) >= self.lasting
         return np.asarray((first * second > 0) & far[0] & far[1] & same)
-
-    def _thin(self, bad: Mask) -> Mask:
-        """Without areas that contain squares."""
-        square = np.ones((self.thick, self.thick), np.uint8)
-        thick = cv2.dilate(cv2.morphologyEx(bad.astype(np.uint8), cv2.MORPH_OPEN, square), _BESIDE)
-        return np.asarray(bad & (thick == 0))
 
     def _lines(self, frames: Sequence[Values]) -> NDArray[np.float32]:
         """(w,) what is to be taken off each column; 0 where they do not differ for certain."""
@@ -190,6 +184,13 @@ def _whole(frame: Values) -> Values:
         return np.ascontiguousarray(frame, np.float32)
     middle = float(np.median(frame[~gaps])) if not gaps.all() else 0.0
     return np.where(gaps, np.float32(middle), frame).astype(np.float32)
+
+
+def thin(bad: Mask, side: int) -> Mask:
+    """What of a mask (h, w) is single pixels and lines: no areas that contain squares of `side`."""
+    square = np.ones((side, side), np.uint8)
+    thick = cv2.dilate(cv2.morphologyEx(bad.astype(np.uint8), cv2.MORPH_OPEN, square), _BESIDE)
+    return np.asarray(bad & (thick == 0))
 
 
 def filled(frame: Values, bad: Mask) -> Values:

@@ -8,7 +8,7 @@ each band: a map of all of them would be a patchwork of bands, so it shows one.
 import os
 import re
 from collections import Counter, defaultdict
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path, PurePosixPath
@@ -288,6 +288,26 @@ def _usual(photos: Sequence[Photo]) -> str:
         return ""
     bands, rank = bands_of(photos), {name: k for k, name in enumerate(PREFERRED)}
     return min(bands, key=lambda name: (-bands[name], rank.get(name, len(rank)), name))
+
+
+def without_partner(
+    files: Sequence[Photo], beside: Mapping[int, int], placed: Container[int], partner: str
+) -> list[RejectedPhoto]:
+    """The files of a second camera that no placed photo of the map was taken together with.
+
+    `beside`: index of a file -> that of the map's photo taken together with it; `placed`: those of
+    the map's photos that are; `partner`: what these are called.
+    """
+    return [
+        RejectedPhoto(
+            name=photo.name,
+            reason=f"the {partner} that was taken together with it is not placed"
+            if j in beside
+            else f"no {partner} was taken together with it",
+        )
+        for j, photo in enumerate(files)
+        if j not in beside or beside[j] not in placed
+    ]
 
 
 def told_left_out(lost: Sequence[RejectedPhoto]) -> list[str]:

@@ -28,7 +28,7 @@ from skyquilt.ortho.compose import Composer
 from skyquilt.ortho.exposure import NEUTRAL, Exposure
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.radiometry import DriftMethod, balances_drift, drift_of, value_tags
-from skyquilt.photos.left_out import told_left_out
+from skyquilt.photos.left_out import told_left_out, without_partner
 from skyquilt.photos.pixels import read_color
 from skyquilt.photos.read import rejected
 from skyquilt.photos.together import taken_together
@@ -83,7 +83,8 @@ def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistrati
     visual, placed = scene.aligned.photos, scene.aligned.alignment
     paired = taken_together(visual, thermal)
     together = [(i, j) for i, j in paired if i in placed.poses]
-    alone = _alone(visual, thermal, paired, placed)
+    beside = {j: i for i, j in paired}
+    alone = without_partner(thermal, beside, placed.poses, "visual photo")
     bad = {j: r for _, j in together if (r := _undecodable(thermal[j])) is not None}
     pairs = [(i, j) for i, j in together if j not in bad]
     if len(pairs) < FindRig.minimum:
@@ -123,26 +124,6 @@ def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistrati
     )
     photos = tuple(thermal[j] for _, j in pairs)
     return Rigged(rig=rig, photos=photos, alignment=alignment, rejected=(*bad.values(), *alone))
-
-
-def _alone(
-    visual: Sequence[Photo],
-    thermal: Sequence[Photo],
-    paired: Sequence[tuple[int, int]],
-    placed: Alignment,
-) -> list[RejectedPhoto]:
-    """The thermal photos that no placed visual one was taken together with."""
-    beside = {j: i for i, j in paired}
-    return [
-        RejectedPhoto(
-            name=photo.name,
-            reason="the visual photo that was taken together with it is not placed"
-            if j in beside
-            else "no visual photo was taken together with it",
-        )
-        for j, photo in enumerate(thermal)
-        if beside.get(j) not in placed.poses
-    ]
 
 
 def _undecodable(photo: Photo) -> RejectedPhoto | None:
