@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from skyquilt.alignment import repairs
+from skyquilt.alignment import false_tilts, repairs
 from skyquilt.alignment.false_tilts import common_tilts, leaning_lines, told_no_tilt
 from skyquilt.alignment.setup import HALF_TURN, TURNED
 from skyquilt.geometry.frames import cam_R_map_from_angles, rotation_from_vector
@@ -154,6 +155,12 @@ def test_few_photos_around_a_field_do_not_tell_a_gimbal_by_chance():
         found += bool(common_tilts(aligned, told, ["c"] * len(told))[1])
     assert told_wrongly == 0
     assert found > 50
+
+
+@pytest.mark.parametrize(("free", "rel"), [(5, 0.05), (8, 0.012), (20, 2e-3), (300, 1e-3)])
+def test_deviations_of_few_observations_are_those_of_student(free, rel):
+    exact = stats.t.isf(stats.norm.sf(false_tilts.COMMON_DEVIATIONS), free)
+    assert false_tilts._as_rare(free) == pytest.approx(exact, rel=rel)
 
 
 def leaning(found, headings, by_deg, count=8):
