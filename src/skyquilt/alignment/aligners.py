@@ -76,7 +76,7 @@ class ByLinks:
         """
         inputs, said = without_crowded(inputs)
         if inputs.former is not None and (grown := added(inputs, self.bundle)) is not None:
-            return without_strange_blocks(with_loose_photos(grown, inputs), inputs.photos)
+            return without_strange_blocks(with_loose_photos(grown, inputs), inputs)
         control = control_in_frame(inputs.control, inputs.photos, inputs.frame)
         found = self.bundle(
             inputs.photos,
@@ -97,7 +97,7 @@ class ByLinks:
         }
         found = without_copied_views(found, [p.name for p in inputs.photos], told, bare)
         found = replace(found, notes=(*found.notes, *said, *one_place_notes(inputs)))
-        found = without_strange_blocks(with_loose_photos(found, inputs), inputs.photos)
+        found = without_strange_blocks(with_loose_photos(found, inputs), inputs)
         return replace(found, why=REQUESTED)
 
 
@@ -236,7 +236,7 @@ def placed_by_metadata(
     return replace(placed, notes=(*placed.notes, *repaired.notes))
 
 
-def without_strange_blocks(found: Alignment, photos: Sequence[Photo]) -> Alignment:
+def without_strange_blocks(found: Alignment, inputs: AlignmentInputs) -> Alignment:
     """The alignment without blocks that no link connects with the largest one and that show
     something else: small ones where that shows the same ground (photos of people or of a room
     before the flight, or a few of another day), and any taken on the ground, at take-off. They
@@ -246,9 +246,9 @@ def without_strange_blocks(found: Alignment, photos: Sequence[Photo]) -> Alignme
     reasons, notes = dict[int, str](), list[str]()
     for block in others:
         shown = [share_shown(found.poses[i], found.camera(i), found, first) for i in block]
-        if _grounded(found, photos, block, first):
+        if _grounded(found, inputs, block, first):
             why = f"not with the {len(first)} of the largest block, which were taken in the air"
-            names = sentence_of([photos[i].name for i in block])
+            names = sentence_of([inputs.photos[i].name for i in block])
             what = f" They were taken on the ground ({names})."
         elif len(block) < STRANGE * len(first) and float(np.mean(shown)) > SHOWN_ALREADY:
             why = f"not with the {len(first)} of the largest block, which show the same ground"
@@ -269,11 +269,12 @@ def without_strange_blocks(found: Alignment, photos: Sequence[Photo]) -> Alignme
 
 
 def _grounded(
-    found: Alignment, photos: Sequence[Photo], block: Sequence[int], first: Sequence[int]
+    found: Alignment, inputs: AlignmentInputs, block: Sequence[int], first: Sequence[int]
 ) -> bool:
     """Whether photos that lie together tell that they were taken on the ground, and those of the
     larger block `first` from high above.
     """
+    photos = inputs.photos
     heights = [photos[i].above_takeoff_m for i in block]
     flown = [h for i in first if (h := photos[i].above_takeoff_m) is not None]
     if None in heights or any(raised(photos[i]) for i in block) or not flown:
