@@ -245,12 +245,11 @@ def without_strange_blocks(found: Alignment, inputs: AlignmentInputs) -> Alignme
     first, *others = [b for b in found.blocks if len(b) > 1] or [()]
     reasons, notes = dict[int, str](), list[str]()
     for block in others:
-        shown = [share_shown(found.poses[i], found.camera(i), found, first) for i in block]
         if _grounded(found, inputs, block, first):
             why = f"not with the {len(first)} of the largest block, which were taken in the air"
             names = sentence_of([inputs.photos[i].name for i in block])
             what = f" They were taken on the ground ({names})."
-        elif len(block) < STRANGE * len(first) and float(np.mean(shown)) > SHOWN_ALREADY:
+        elif len(block) < STRANGE * len(first) and _mostly_shown(found, block, first):
             why = f"not with the {len(first)} of the largest block, which show the same ground"
             what = (
                 " They show something else, or it looks different on them (another day); if they"
@@ -266,6 +265,12 @@ def without_strange_blocks(found: Alignment, inputs: AlignmentInputs) -> Alignme
     if not reasons:
         return found
     return replace(without_photos(found, reasons), notes=(*found.notes, *notes))
+
+
+def _mostly_shown(found: Alignment, block: Sequence[int], first: Sequence[int]) -> bool:
+    """Whether the larger block `first` shows most of what the photos of a block show."""
+    shown = [share_shown(found.poses[i], found.camera(i), found, first) for i in block]
+    return float(np.mean(shown)) > SHOWN_ALREADY
 
 
 def _grounded(

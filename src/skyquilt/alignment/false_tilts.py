@@ -309,14 +309,13 @@ def _fitted(*groups: _Group) -> _Fit:
     """
     k = groups[-1].rows.shape[2]
     x: NDArray[Any] = np.zeros(k)
-    settled = [0.0 for _ in groups]
+    free = [float(g.told.size - g.means) for g in groups]
     for again in range(ROUNDS):
         N, y, parts = np.eye(k) * WIDEST**-2, np.zeros(k), []
         left = [np.linalg.norm(g.told - g.rows @ x[: g.rows.shape[2]], axis=1) for g in groups]
-        for g, away, fixed in zip(groups, left, settled, strict=True):
-            free = max(g.told.size - g.means - fixed, 1.0)
+        for g, away, few in zip(groups, left, free, strict=True):
             one = float(np.median(away)) / MEDIAN_LENGTH[g.told.shape[1]]
-            scatter = max(one * np.sqrt(g.told.size / free), g.least)
+            scatter = max(one * np.sqrt(g.told.size / max(few, 1.0)), g.least)
             far = (away / (CUT * scatter)) ** 2 if again else np.zeros(len(away))
             weight, known = scatter**-2 / (1 + far), slice(g.rows.shape[2])
             own = np.zeros((k, k))
@@ -326,9 +325,12 @@ def _fitted(*groups: _Group) -> _Fit:
             parts.append(own)
         covariance = np.linalg.inv(N)
         x = np.asarray(covariance @ y)
-        settled = [float((covariance * own).sum()) for own in parts]
-    free = min(g.told.size - g.means - f for g, f in zip(groups, settled, strict=True))
-    return _Fit(x=x, covariance=np.asarray(covariance), left=left[0], most=_as_rare(max(free, 1.0)))
+        free = [
+            g.told.size - g.means - float((covariance * own).sum())
+            for g, own in zip(groups, parts, strict=True)
+        ]
+    most = _as_rare(max(min(free), 1.0))
+    return _Fit(x=x, covariance=np.asarray(covariance), left=left[0], most=most)
 
 
 def _as_rare(free: float) -> float:
