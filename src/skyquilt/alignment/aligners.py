@@ -15,17 +15,18 @@ from skyquilt.alignment.copied_views import without_copied_views
 from skyquilt.alignment.crowded_positions import at_their_middle, one_place_notes, without_crowded
 from skyquilt.alignment.determined import ground_places
 from skyquilt.alignment.inputs import AlignmentInputs
+from skyquilt.alignment.motion import headings_by_course
 from skyquilt.alignment.oblique import tilted, without_photos
 from skyquilt.alignment.pose import ByMetadata, ByPose
 from skyquilt.alignment.repair import Repaired, repair
 from skyquilt.alignment.start import ground_of
 from skyquilt.errors import AlignmentError
 from skyquilt.geometry.camera import shown
-from skyquilt.geometry.frames import cam_R_map_from_angles
+from skyquilt.geometry.frames import angles_from_cam_R_map, cam_R_map_from_angles
 from skyquilt.model.camera import Camera
 from skyquilt.model.features import Features
 from skyquilt.model.photo import Photo
-from skyquilt.model.poses import Alignment, Pose, Prior
+from skyquilt.model.poses import Alignment, Pose
 from skyquilt.photos.implausible_positions import raised
 from skyquilt.photos.side_rows import sentence_of
 
@@ -65,7 +66,7 @@ class ByLinks:
 
     bundle: Bundle = field(default_factory=Bundle)
     """The adjustment."""
-    version: ClassVar[int] = 13
+    version: ClassVar[int] = 14
     needs_links: ClassVar[bool] = True
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -136,7 +137,7 @@ class Auto:
     """For linked photos."""
     pose: ByReport
     """For photos that only have positions."""
-    version: ClassVar[int] = 13
+    version: ClassVar[int] = 14
     needs_links: ClassVar[bool] = True
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -291,21 +292,25 @@ def _grounded(
 
 def with_loose_photos(alignment: Alignment, inputs: AlignmentInputs) -> Alignment:
     """Adds photos without links, placed by their own metadata relative to the adjusted ones, with a
-    note each; photos that lack metadata, or are black or white, are rejected.
+    note each; photos that lack metadata, or are black or white, are rejected. Where only the
+    heading is missing, the direction of flight tells it, if it tells that of the adjusted ones.
     """
     photos, priors = inputs.photos, inputs.priors
     poses, cameras = dict(alignment.poses), dict(alignment.cameras)
     camera_of, rejected = dict(alignment.camera_of), dict(alignment.rejected)
     blocks, notes = list(alignment.blocks), list(alignment.notes)
     offset = median_offset(alignment, priors)
+    flown = _flown(alignment, inputs, offset)
     for i, photo in enumerate(photos):
         if i in poses:
             continue
         C = priors[i].map_C + offset
         if i in alignment.rejected and tilted(priors[i]):
             continue  # a tilt turns errors of metadata into large displacements
-        if alignment.frame.crs is None or _lacking(C, priors[i]):
-            lacking = _lacking(C, priors[i]) or "no heading"
+        by_course = not np.isfinite(priors[i].yaw_deg)
+        yaw = flown[i] if by_course else priors[i].yaw_deg
+        if alignment.frame.crs is None or _lacking(C, yaw):
+            lacking = _lacking(C, yaw) or "no heading"
             reason = "it could not be linked to the other photos, and it has"
             rejected[i] = rejected.get(i, f"{reason} {lacking} to place it by")
             continue
@@ -314,7 +319,7 @@ def with_loose_photos(alignment: Alignment, inputs: AlignmentInputs) -> Alignmen
             notes.append(f"{photo.name} is left out: {rejected[i]}.")
             continue
         weak = rejected.pop(i, "it could not be linked to any other photo")
-        R = cam_R_map_from_angles(priors[i].yaw_deg, priors[i].pitch_deg, priors[i].roll_deg)
+        R = cam_R_map_from_angles(yaw, priors[i].pitch_deg, priors[i].roll_deg)
         if shown_already(Pose(cam_R_map=R, map_C=C), photo.lens, alignment):
             rejected[i] = (
                 f"{weak}, and what it would show by its metadata is shown by photos that are"
@@ -324,7 +329,8 @@ def with_loose_photos(alignment: Alignment, inputs: AlignmentInputs) -> Alignmen
         cameras.setdefault(photo.camera_key, photo.lens)
         camera_of[i] = photo.camera_key
         blocks.append((i,))
-        notes.append(f"{photo.name} is placed by its metadata: {weak}.")
+        by = "position and the direction of flight" if by_course else "metadata"
+        notes.append(f"{photo.name} is placed by its {by}: {weak}.")
     return replace(
         alignment,
         poses=poses,
@@ -334,6 +340,29 @@ def with_loose_photos(alignment: Alignment, inputs: AlignmentInputs) -> Alignmen
         blocks=tuple(blocks),
         notes=tuple(notes),
     )
+
+
+def _flown(
+    alignment: Alignment, inputs: AlignmentInputs, offset: NDArray[np.float64]
+) -> list[float]:
+    """Headings in degrees by the direction of flight of photos that are not placed and report none;
+    NaN of others, and where it does not tell.
+    """
+    at = np.array([prior.map_C[:2] for prior in inputs.priors]) + offset[:2]
+    yaw = np.full(len(at), np.nan)
+    lacking = [
+        i
+        for i, prior in enumerate(inputs.priors)
+        if i not in alignment.poses and np.isnan(prior.yaw_deg) and np.isfinite(at[i]).all()
+    ]
+    if lacking:
+        for i in alignment.held:
+            at[i] = alignment.poses[i].map_C[:2]
+            yaw[i] = angles_from_cam_R_map(alignment.poses[i].cam_R_map)[0]
+        asked = [*alignment.held, *lacking]
+        told = headings_by_course([inputs.photos[i] for i in asked], at[asked], yaw[asked])
+        yaw[asked] = told
+    return yaw.tolist()
 
 
 def one_tone(photo: Photo, grey: Callable[[int], NDArray[np.uint8]]) -> bool:
@@ -374,10 +403,10 @@ def share_shown(pose: Pose, camera: Camera, alignment: Alignment, by: Sequence[i
     return float(there.mean())
 
 
-def _lacking(C: NDArray[np.float64], prior: Prior) -> str:
+def _lacking(C: NDArray[np.float64], yaw_deg: float) -> str:
     """The data missing for placing a photo; empty if nothing is missing."""
     if not np.isfinite(C[:2]).all():
         return "no position"
     if not np.isfinite(C[2]):
         return "no height"
-    return "" if np.isfinite(prior.yaw_deg) else "no heading"
+    return "" if np.isfinite(yaw_deg) else "no heading"

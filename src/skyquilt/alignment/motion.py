@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.geometry.frames import angle_difference_deg
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment
 
@@ -22,6 +23,10 @@ LONGEST_GAP_S = 60.0
 """Photos further apart than this in s do not tell the speed in between."""
 HOVERS = 0.3
 """A drone that reports less than this share of its mean speed slows down for its photos."""
+FEWEST_HEADED, LIKE_DEG, MOST_ALIKE = 5, 20.0, 0.9
+"""Photos that tell how a camera is headed as it flies, at least; how far in degrees their headings
+lie from their mean at most; and the share of them of which that must hold.
+"""
 REACH = 3
 """Neighbours before and after a photo that tell its velocity; twice as many tell its climb, and
 where times are given in whole seconds only.
@@ -74,6 +79,37 @@ def velocities_of(photos: Sequence[Photo], alignment: Alignment) -> dict[int, Ar
 def speeds_of(photos: Sequence[Photo]) -> Speeds:
     """The velocities of some of these photos, wherever they are placed."""
     return lambda own, C: velocities([photos[i] for i in own], C)
+
+
+def headings_by_course(photos: Sequence[Photo], C: Array, yaw_deg: Array) -> Array:
+    """Headings (n,) in degrees of photos that have none in `yaw_deg` (n,), at C (n, 2) in m, by
+    those of the others: cameras turn with the flight, or keep one heading. NaN where the others do
+    not tell, where both would be possible and differ, or where a photo's course is not known.
+    """
+    v = velocities(photos, np.column_stack([C, np.zeros(len(C))]))
+    course = np.degrees(np.arctan2(v[:, 0], v[:, 1]))
+    course[np.hypot(v[:, 0], v[:, 1]) == 0] = np.nan
+    found = np.full(len(photos), np.nan)
+    keys = np.array([photo.camera_key for photo in photos])
+    for key in dict.fromkeys(keys.tolist()):
+        known = (keys == key) & np.isfinite(yaw_deg) & np.isfinite(course)
+        wanted = (keys == key) & ~np.isfinite(yaw_deg) & np.isfinite(course)
+        turned = course[wanted] + _common_deg((yaw_deg - course)[known])
+        kept = np.full(len(turned), _common_deg(yaw_deg[known]))
+        apart = np.abs(angle_difference_deg(turned, kept)) > LIKE_DEG
+        found[wanted] = np.where(
+            np.isnan(turned), kept, np.where(apart & np.isfinite(kept), np.nan, turned)
+        )
+    return np.asarray(angle_difference_deg(found, 0.0))
+
+
+def _common_deg(angles_deg: Array) -> float:
+    """The mean of angles that lie near together; NaN if they do not, or are few."""
+    if len(angles_deg) < FEWEST_HEADED:
+        return np.nan
+    mean = float(np.degrees(np.angle(np.exp(1j * np.radians(angles_deg)).sum())))
+    near = np.abs(angle_difference_deg(angles_deg, mean)) < LIKE_DEG
+    return mean if near.mean() >= MOST_ALIKE else np.nan
 
 
 def _along(time: Array, C: Array) -> Array:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.motion import headings_by_course
 from skyquilt.alignment.priors import choose_frame
 from skyquilt.errors import UsageError
 from skyquilt.geometry.frames import (
@@ -72,7 +73,7 @@ class Metadata:
         if not np.isfinite(prior.map_C[:2]).all():
             return None
         turn, lift, level = self._corrections(member)
-        yaw = prior.yaw_deg - turn if np.isfinite(prior.yaw_deg) else 0.0
+        yaw = prior.yaw_deg - turn if np.isfinite(prior.yaw_deg) else self._flown(member)
         datum = self.members.frame.vertical_datum if self.members.frame else "unknown"
         z = prior.map_C[2]
         if np.isfinite(level):
@@ -87,6 +88,26 @@ class Metadata:
             0.0 if abs(turn) > 90 else prior.roll_deg,
         )
         return Pose(cam_R_map=R, map_C=np.array([prior.map_C[0], prior.map_C[1], z]))
+
+    def _flown(self, member: Member) -> float:
+        """The heading in degrees of a photo that reports none, by its direction of flight, as recent
+        photos of the source are headed; 0 where these do not tell it.
+        """
+        known, poses = [], []
+        for other in self._recent[_source(member)].values():
+            if other.pose is not None and other.id != member.id:
+                known.append(other)
+                poses.append(other.pose)
+        if not known:
+            return 0.0
+        C = np.array([pose.map_C[:2] for pose in poses])
+        off = C - np.array([m.prior.map_C[:2] for m in known])
+        off = off[np.isfinite(off).all(1)]
+        own = member.prior.map_C[:2] + (np.median(off, axis=0) if len(off) else 0.0)
+        yaw = [*(angles_from_cam_R_map(pose.cam_R_map)[0] for pose in poses), np.nan]
+        photos = [*(m.photo for m in known), member.photo]
+        told = headings_by_course(photos, np.vstack([C, own]), np.array(yaw))[-1]
+        return float(told) if np.isfinite(told) else 0.0
 
     def _corrections(self, member: Member) -> tuple[float, float, float]:
         """Error of the headings (deg) and heights (m) that recent photos of the source reported,
