@@ -213,6 +213,38 @@ def test_what_metadata_are_worth_tells_whether_photos_are_drawn_by_them(
     live.close()
 
 
+@pytest.mark.slow
+def test_a_photo_without_heading_that_matches_nothing_lies_along_its_line(
+    flight, tmp_path, monkeypatch
+):
+    photos = []
+    for path in flight.photos:
+        photos.append(tmp_path / path.name)
+        shutil.copyfile(path, photos[-1])
+        relabel(photos[-1], drop=("xmp",))
+    live = LiveMap(tmp_path / "out", SETTINGS)
+    honest = live.live_links._compared
+    monkeypatch.setattr(
+        live.live_links, "_compared", lambda a, b: None if 6 in (a, b) else honest(a, b)
+    )
+    monkeypatch.setattr(live.initial_pose.metadata, "loose", lambda *_: False)
+    for path in photos:
+        live.intake.take_file(path, "")
+    live.queues.received.extend(live.members.take_up())
+    while live._placed():  # all of them before one is refined, as on a busy machine
+        pass
+    for _ in live.drain_all():
+        pass
+    member = live.members.by_id[6]
+    assert [m.state for m in live.members.by_id.values()] == ["refined"] * 5 + ["placed"]
+    headed, true = (
+        angles_from_cam_R_map(R)[0]
+        for R in (member.pose.cam_R_map, flight.rotation(member.photo.name))
+    )
+    assert abs(angle_difference_deg(headed, true)) < 15
+    live.close()
+
+
 def test_a_photo_that_matches_nothing_is_drawn_by_its_metadata(flight, tmp_path, monkeypatch):
     live = LiveMap(tmp_path / "out", SETTINGS)
     live.add(flight.photos[0])

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.geometry.frames import angle_difference_deg
+from skyquilt.geometry.frames import angle_difference_deg, commonest_deg
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment
 
@@ -23,9 +23,9 @@ LONGEST_GAP_S = 60.0
 """Photos further apart than this in s do not tell the speed in between."""
 HOVERS = 0.3
 """A drone that reports less than this share of its mean speed slows down for its photos."""
-FEWEST_HEADED, LIKE_DEG, MOST_ALIKE = 5, 20.0, 0.9
-"""Photos that tell how a camera is headed as it flies, at least; how far in degrees their headings
-lie from their mean at most; and the share of them of which that must hold.
+FEWEST_HEADED, MOST_ALIKE, AMBIGUOUS_DEG = 4, 0.8, 20.0
+"""Photos that tell how a camera is headed as it flies, at least; the share of them that must be
+headed alike; and by how many degrees two answers differ from each other.
 """
 REACH = 3
 """Neighbours before and after a photo that tell its velocity; twice as many tell its climb, and
@@ -96,7 +96,7 @@ def headings_by_course(photos: Sequence[Photo], C: Array, yaw_deg: Array) -> Arr
         wanted = (keys == key) & ~np.isfinite(yaw_deg) & np.isfinite(course)
         turned = course[wanted] + _common_deg((yaw_deg - course)[known])
         kept = np.full(len(turned), _common_deg(yaw_deg[known]))
-        apart = np.abs(angle_difference_deg(turned, kept)) > LIKE_DEG
+        apart = np.abs(angle_difference_deg(turned, kept)) > AMBIGUOUS_DEG
         found[wanted] = np.where(
             np.isnan(turned), kept, np.where(apart & np.isfinite(kept), np.nan, turned)
         )
@@ -104,12 +104,11 @@ def headings_by_course(photos: Sequence[Photo], C: Array, yaw_deg: Array) -> Arr
 
 
 def _common_deg(angles_deg: Array) -> float:
-    """The mean of angles that lie near together; NaN if they do not, or are few."""
+    """The angle near which most lie; NaN if too few do, or there are few."""
     if len(angles_deg) < FEWEST_HEADED:
         return np.nan
-    mean = float(np.degrees(np.angle(np.exp(1j * np.radians(angles_deg)).sum())))
-    near = np.abs(angle_difference_deg(angles_deg, mean)) < LIKE_DEG
-    return mean if near.mean() >= MOST_ALIKE else np.nan
+    common, share = commonest_deg(angles_deg)
+    return common if share >= MOST_ALIKE else np.nan
 
 
 def _along(time: Array, C: Array) -> Array:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.start import OWN_ZERO, ground_of
 from skyquilt.errors import AlignmentError
-from skyquilt.geometry.frames import cam_R_map_from_angles
+from skyquilt.geometry.frames import cam_R_map_from_angles, commonest_deg
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, MapFrame, Pose, Prior, no_ties
 
@@ -176,8 +176,5 @@ class ByPosition(ByMetadata):
         if self.heading_deg is not None:
             return self.heading_deg
         yaw = np.array([p.yaw_deg for p in priors])
-        unit = np.exp(1j * np.radians(yaw[np.isfinite(yaw)]))
-        if not unit.size:
-            return 0.0
-        near = np.abs(unit[:, None] - unit[None]) < np.radians(20)
-        return float(np.degrees(np.angle(unit[near[near.sum(1).argmax()]].mean())))
+        told = yaw[np.isfinite(yaw)]
+        return commonest_deg(told)[0] if told.size else 0.0

@@ -110,6 +110,16 @@ def rotation_from_vector(w: Matrix) -> Matrix:
 Array = NDArray[np.float64]
 
 
+def commonest_deg(angles_deg: Array) -> tuple[float, float]:
+    """The mean in degrees of those angles (n,) that lie within 20 degrees of the one with most of
+    them around it, and their share. Of many, 500 or so are looked at.
+    """
+    unit = np.exp(1j * np.radians(angles_deg[:: max(1, len(angles_deg) // 500)]))
+    near = np.abs(unit[:, None] - unit[None]) < 2 * np.sin(np.radians(20.0) / 2)
+    most = near[near.sum(1).argmax()]
+    return float(np.degrees(np.angle(unit[most].sum()))), float(most.mean())
+
+
 def turning(a: Array, b: Array) -> Array:
     """The rotation b_R_a (3, 3) that best takes directions a (n, 3) to b (n, 3): Wahba's problem
     (Markley 1988).

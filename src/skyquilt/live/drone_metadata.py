@@ -90,8 +90,8 @@ class Metadata:
         return Pose(cam_R_map=R, map_C=np.array([prior.map_C[0], prior.map_C[1], z]))
 
     def _flown(self, member: Member) -> float:
-        """The heading in degrees of a photo that reports none, by its direction of flight, as recent
-        photos of the source are headed; 0 where these do not tell it.
+        """The heading in degrees of a photo that reports none, by its direction of flight, as
+        recent photos of the source are headed; 0 where these do not tell it.
         """
         known, poses = [], []
         for other in self._recent[_source(member)].values():

@@ -69,9 +69,11 @@ class Refinement:
             return Update(what="noted", photo=member.id)
         change = self.local_pose.refine(member, self._rejoining.pop(member.id, {}))
         found = self._found(member, change)
-        self._commit(member, change, found)
+        turned = self._commit(member, change, found)
         if member.id in self.redraw.held:  # it is linked with none: by its metadata then
             self.redraw.show(member)
+        elif turned:
+            self.redraw.moved(member)
         self.queues.untried.popleft()
         self._requeue(member, found)
         alone = "waiting" if self.members.frame is None else "loose"
@@ -82,7 +84,10 @@ class Refinement:
             text=change.reason,
         )
 
-    def _commit(self, member: Member, change: Change, found: list[Member]) -> None:
+    def _commit(self, member: Member, change: Change, found: list[Member]) -> bool:
+        """Stores what was found; returns whether the photo, linked with none and without a heading,
+        stands otherwise by what those before it tell of the direction of flight.
+        """
         far = self._distance(member, change) > LOOP
         for a, b in (key for key, k in change.links.items() if k is not None):
             self.members.joined(a, b)
@@ -100,6 +105,7 @@ class Refinement:
             self.put_back(change.rejected)
             if member.state == "refined":
                 self._learn(member, loop=far)
+            turned = member.state == "placed" and self._headed(member)
             why = change.reason
             if why and (note := self.members.far_note(member.photo)):
                 why = f"{why}; {note}"
@@ -114,6 +120,19 @@ class Refinement:
         for other in altered.values():
             self.redraw.altered(other)
         self.local_pose.neighbours.indexed(member)
+        return turned
+
+    def _headed(self, member: Member) -> bool:
+        """Gives a photo that reports no heading the one by the direction of flight; whether that is
+        another one.
+        """
+        if np.isfinite(member.prior.yaw_deg) or member.pose is None:
+            return False
+        pose = self.local_pose.metadata.first(member)
+        if pose is None or np.allclose(pose.cam_R_map, member.pose.cam_R_map):
+            return False
+        member.pose = pose
+        return True
 
     def _learn(self, member: Member, *, loop: bool) -> None:
         self.local_pose.metadata.learn(member)
