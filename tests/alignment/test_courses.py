@@ -8,8 +8,10 @@ from datetime import datetime, timedelta
 import numpy as np
 import pytest
 
-from skyquilt.alignment.aligners import with_loose_photos
+from skyquilt.alignment import repair as repair_module
+from skyquilt.alignment.aligners import by_pose, with_loose_photos
 from skyquilt.alignment.motion import headings_by_course
+from skyquilt.alignment.repair import Repaired
 from skyquilt.geometry.frames import angle_difference_deg, cam_R_map_from_angles
 from skyquilt.model.poses import Pose
 from tests.alignment.surveys import photo, prior
@@ -102,3 +104,41 @@ def test_unlinked_photos_of_water_lie_along_the_line_of_flight():
         np.testing.assert_allclose(pose.map_C, [*C[i], 60.0], atol=0.01)
         np.testing.assert_allclose(pose.cam_R_map, poses[i].cam_R_map, atol=0.05)
     assert sum("position and the direction of flight" in note for note in found.notes) == 6
+
+
+@pytest.mark.parametrize("height_m", [60.0, None])
+def test_photos_that_share_next_to_nothing_are_placed_along_the_line_of_flight(height_m):
+    photos, C, yaw = lines(noise_m=0.0)
+    done = block([at_place(x, y) for x, y in C], hills(300, wide=150.0))
+    frame = replace(done.frame, crs="EPSG:32630", vertical_datum="sea_level")
+    one = replace(
+        done, frame=frame, poses={3: done.poses[3]}, blocks=((3,),), rejected={4: "no link"}
+    )
+    inputs = seeing_nothing(photos, one)
+    inputs = replace(inputs, priors=[prior((x, y, 500.0), yaw=np.nan) for x, y in C])
+    found = by_pose(height_m, repair=True).instead_of(one, inputs)
+    if height_m is None:
+        assert found.poses.keys() == {3} and "--height" in found.notes[-1]
+        return
+    assert found.method == "pose" and len(found.poses) == len(photos) and not found.rejected
+    for i, pose in found.poses.items():
+        np.testing.assert_allclose(pose.cam_R_map, cam_R_map_from_angles(yaw[i]), atol=0.05)
+    assert "where it goes" in found.notes[-1]
+    held = replace(one, poses=dict(list(done.poses.items())[:4]), blocks=((0, 1, 2, 3),))
+    assert by_pose(height_m, repair=True).instead_of(held, inputs) is held
+
+
+def test_headings_of_a_few_links_turn_no_other_photos():
+    photos, C, yaw = lines(noise_m=0.0)
+    bare = [prior((x, y, 60.0), yaw=np.nan) for x, y in C]
+    wrong = replace(bare[0], yaw_deg=5.0, yaw_source="pixels")
+    linked = Repaired(
+        priors=(wrong, wrong, wrong, *bare[3:]), heights_m=np.full(len(C), 9.0), notes=()
+    )
+    few = repair_module._without_few(linked, bare)
+    assert np.isnan([p.yaw_deg for p in few.priors]).all() and np.isnan(few.heights_m).all()
+    found = repair_module._headed(few, photos)
+    off = angle_difference_deg(np.array([p.yaw_deg for p in found.priors]), yaw)
+    assert np.abs(off).max() < 1
+    told = [replace(bare[0], yaw_deg=5.0), *bare[1:]]  # a reported heading is another thing
+    assert repair_module._without_few(linked, told) is linked

@@ -42,8 +42,10 @@ WAYS = (
 )
 STAGES = ["matching", "alignment", "ortho", "imaging", "geometry", "papers"]
 IN_NO_KEY = {
-    "SIGMA_YAW_DEG": "repaired metadata are in the key of the alignment, by value",
-    "SIGMA_HEIGHT": "the same",
+    **dict.fromkeys(
+        ("SIGMA_YAW_DEG", "SIGMA_COURSE_DEG"),
+        "repaired metadata are in the key of the alignment, by value",
+    ),
     "YAW_DEG": "conflicts are told in the report and shape nothing",
     "_EPOCH": "where weeks of GPS begin; positions are in keys by value",
     "CERTAIN": "conflicts are told in the report and shape nothing",

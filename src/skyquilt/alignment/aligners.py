@@ -15,11 +15,10 @@ from skyquilt.alignment.copied_views import without_copied_views
 from skyquilt.alignment.crowded_positions import at_their_middle, one_place_notes, without_crowded
 from skyquilt.alignment.determined import ground_places
 from skyquilt.alignment.inputs import AlignmentInputs
-from skyquilt.alignment.motion import headings_by_course
+from skyquilt.alignment.motion import FEWEST_HEADED, headings_by_course
 from skyquilt.alignment.oblique import tilted, without_photos
 from skyquilt.alignment.pose import ByMetadata, ByPose
-from skyquilt.alignment.repair import Repaired, repair
-from skyquilt.alignment.start import ground_of
+from skyquilt.alignment.repair import Repaired, repaired_metadata
 from skyquilt.errors import AlignmentError
 from skyquilt.geometry.camera import shown
 from skyquilt.geometry.frames import angles_from_cam_R_map, cam_R_map_from_angles
@@ -54,6 +53,8 @@ ONE_TONE = "it is black or white all over"
 """The reason recorded for such a photo."""
 UNTIED = "no point that photos share has a place of its own, so each is placed by its metadata"
 """Why a panorama is not adjusted."""
+LOOSE = "photos share too little to be adjusted together, so each is placed by its metadata"
+"""Why photos that hardly overlap are not."""
 REQUESTED = "asked for"
 """The reason recorded for a method that the user requested."""
 
@@ -112,7 +113,7 @@ class ByReport:
     """Which metadata are used."""
     repair: bool = True
     """Whether links may correct the metadata."""
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     @property
     def needs_links(self) -> bool:
@@ -127,6 +128,19 @@ class ByReport:
         """
         repaired = repaired_metadata(inputs) if self.repair else None
         return replace(placed_by_metadata(self.method, inputs, repaired), why=REQUESTED)
+
+    def instead_of(self, few: Alignment, inputs: AlignmentInputs) -> Alignment:
+        """All photos placed by metadata where an adjustment held next to none and that is twice as
+        many; otherwise what the adjustment found.
+        """
+        if len(few.held) >= FEWEST_HEADED or 2 * len(few.poses) >= len(inputs.photos):
+            return few
+        try:
+            found = self(inputs)
+        except AlignmentError as error:
+            said = f"More photos could be placed by their metadata, but {error}."
+            return replace(few, notes=(*few.notes, said))
+        return replace(found, why=LOOSE) if len(found.poses) > 2 * len(few.poses) else few
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,6 +167,9 @@ class Auto:
         try:
             method, why = choose_method(len(inputs.photos), len(inputs.links), positions, control)
             found = (self.bundle if method == "bundle" else self.pose)(inputs)
+            if method == "bundle" and positions:
+                found = self.pose.instead_of(found, inputs)
+                why = found.why if found.method == "pose" else why
             if not found.poses and positions:
                 notes, why = found.notes, UNTIED
                 found = replace(self.pose, repair=False)(at_their_middle(inputs))
@@ -216,15 +233,6 @@ def choose_method(photos: int, links: int, positions: int, control: int) -> tupl
 def by_pose(height_m: float | None, repair: bool) -> ByReport:
     """The aligner `pose`."""
     return ByReport(method=ByPose(height_m=height_m), repair=repair)
-
-
-def repaired_metadata(inputs: AlignmentInputs) -> Repaired | None:
-    """Metadata, corrected where the links contradict them; None without links."""
-    if not inputs.links:
-        return None
-    convergence = inputs.frame.convergence_deg
-    ground = ground_of(inputs.frame)
-    return repair(inputs.photos, inputs.priors, inputs.features, inputs.links, convergence, ground)
 
 
 def placed_by_metadata(

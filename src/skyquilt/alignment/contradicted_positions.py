@@ -90,7 +90,8 @@ def loose_warnings(priors: Sequence[Prior], alignment: Alignment) -> list[str]:
 
     Positions err as they state, or as they are seen to at most, whichever is less.
     """
-    held = [i for i in max(alignment.blocks, key=len, default=()) if i in alignment.poses]
+    block = max(alignment.blocks, key=len, default=())
+    held = [i for i in (block if len(block) > 1 else alignment.poses) if i in alignment.poses]
     told = [i for i in held if np.isfinite(priors[i].map_C[:2]).all()]
     control = any(not c.check for c in alignment.control)
     if alignment.frame.crs is None or not told or control:

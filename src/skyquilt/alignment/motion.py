@@ -81,11 +81,17 @@ def speeds_of(photos: Sequence[Photo]) -> Speeds:
     return lambda own, C: velocities([photos[i] for i in own], C)
 
 
-def headings_by_course(photos: Sequence[Photo], C: Array, yaw_deg: Array) -> Array:
+def headings_by_course(
+    photos: Sequence[Photo], C: Array, yaw_deg: Array, *, assumed: bool = False
+) -> Array:
     """Headings (n,) in degrees of photos that have none in `yaw_deg` (n,), at C (n, 2) in m, by
     those of the others: cameras turn with the flight, or keep one heading. NaN where the others do
     not tell, where both would be possible and differ, or where a photo's course is not known.
+
+    `assumed`: few of the others are enough, and where there are none, the top of the picture is
+    taken to show where the flight goes.
     """
+    fewest = 1 if assumed else FEWEST_HEADED
     v = velocities(photos, np.column_stack([C, np.zeros(len(C))]))
     course = np.degrees(np.arctan2(v[:, 0], v[:, 1]))
     course[np.hypot(v[:, 0], v[:, 1]) == 0] = np.nan
@@ -94,8 +100,9 @@ def headings_by_course(photos: Sequence[Photo], C: Array, yaw_deg: Array) -> Arr
     for key in dict.fromkeys(keys.tolist()):
         known = (keys == key) & np.isfinite(yaw_deg) & np.isfinite(course)
         wanted = (keys == key) & ~np.isfinite(yaw_deg) & np.isfinite(course)
-        turned = course[wanted] + _common_deg((yaw_deg - course)[known])
-        kept = np.full(len(turned), _common_deg(yaw_deg[known]))
+        aside = 0.0 if assumed and not known.any() else _common((yaw_deg - course)[known], fewest)
+        turned = course[wanted] + aside
+        kept = np.full(len(turned), _common(yaw_deg[known], fewest))
         apart = np.abs(angle_difference_deg(turned, kept)) > AMBIGUOUS_DEG
         found[wanted] = np.where(
             np.isnan(turned), kept, np.where(apart & np.isfinite(kept), np.nan, turned)
@@ -103,9 +110,9 @@ def headings_by_course(photos: Sequence[Photo], C: Array, yaw_deg: Array) -> Arr
     return np.asarray(angle_difference_deg(found, 0.0))
 
 
-def _common_deg(angles_deg: Array) -> float:
-    """The angle near which most lie; NaN if too few do, or there are few."""
-    if len(angles_deg) < FEWEST_HEADED:
+def _common(angles_deg: Array, fewest: int) -> float:
+    """The angle in degrees near which most lie; NaN if too few do, or there are few."""
+    if len(angles_deg) < fewest:
         return np.nan
     common, share = commonest_deg(angles_deg)
     return common if share >= MOST_ALIKE else np.nan

@@ -7,18 +7,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.conflicts import YAW_DEG
-from skyquilt.alignment.start import find_start
+from skyquilt.alignment.inputs import AlignmentInputs
+from skyquilt.alignment.motion import FEWEST_HEADED, headings_by_course
+from skyquilt.alignment.start import find_start, ground_of
 from skyquilt.geometry.frames import angle_difference_deg
 from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Prior
+from skyquilt.photos.side_rows import sentence_of
 
 SIGMA_YAW_DEG = 3.0
 """Standard deviation in degrees of a heading from links. Tilts and relief disturb the similarities
 a little.
 """
-SIGMA_HEIGHT = 0.05
-"""Relative standard deviation of a height from image scale."""
+SIGMA_COURSE_DEG = 15.0
+"""That of a heading by the direction of flight: wind and turns."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,6 +36,55 @@ class Repaired:
     """
     notes: tuple[str, ...]
     """Messages about each correction, with both values."""
+
+
+def repaired_metadata(inputs: AlignmentInputs) -> Repaired:
+    """Metadata, corrected where the links contradict them; headings that are still missing are
+    those of the flight.
+    """
+    photos, priors, frame = inputs.photos, inputs.priors, inputs.frame
+    found = Repaired(priors=tuple(priors), heights_m=np.full(len(photos), np.nan), notes=())
+    if inputs.links:
+        ground = ground_of(frame)
+        found = repair(photos, priors, inputs.features, inputs.links, frame.convergence_deg, ground)
+    return _headed(_without_few(found, priors), photos)
+
+
+def _without_few(found: Repaired, priors: Sequence[Prior]) -> Repaired:
+    """The metadata as reported, where no photo reports a heading and links give one to a few only:
+    they may be wrong, and all other photos would be headed by them.
+    """
+    linked = sum(p.yaw_source == "pixels" for p in found.priors)
+    told = any(np.isfinite(p.yaw_deg) for p in priors)
+    if told or not 0 < linked < FEWEST_HEADED or linked == len(priors):
+        return found
+    return Repaired(priors=tuple(priors), heights_m=np.full(len(priors), np.nan), notes=())
+
+
+def _headed(found: Repaired, photos: Sequence[Photo]) -> Repaired:
+    """The same with headings by the direction of flight where there are none, and a note."""
+    at = np.array([p.map_C[:2] for p in found.priors])
+    yaw = np.array([p.yaw_deg for p in found.priors])
+    known = np.flatnonzero(np.isfinite(at).all(1))
+    if np.isfinite(yaw[known]).all():
+        return found
+    own = [photos[i] for i in known.tolist()]
+    course = np.full(len(yaw), np.nan)
+    course[known] = headings_by_course(own, at[known], yaw[known], assumed=True)
+    flown = np.isfinite(course)
+    priors = tuple(
+        replace(p, yaw_deg=float(c), sigma_yaw_deg=SIGMA_COURSE_DEG, yaw_source="flight")
+        if headed
+        else p
+        for p, c, headed in zip(found.priors, course, flown, strict=True)
+    )
+    if not flown.any():
+        return found
+    guessed = not np.isfinite(yaw[known]).any()
+    how = "their tops are taken to show where it goes" if guessed else "as the others are headed"
+    names = sentence_of([photos[i].name for i in np.flatnonzero(flown).tolist()])
+    said = f"Photos without a heading are drawn along the direction of flight, {how}: {names}."
+    return replace(found, priors=priors, notes=(*found.notes, said))
 
 
 def repair(

@@ -8,15 +8,10 @@ from typing import Any, ClassVar, cast
 import numpy as np
 
 from skyquilt import registry
-from skyquilt.alignment.aligners import (
-    REQUESTED,
-    ByReport,
-    by_pose,
-    placed_by_metadata,
-    repaired_metadata,
-)
+from skyquilt.alignment.aligners import REQUESTED, ByReport, by_pose, placed_by_metadata
 from skyquilt.alignment.crowded_positions import without_heights
 from skyquilt.alignment.inputs import AlignmentInputs
+from skyquilt.alignment.repair import repaired_metadata
 from skyquilt.alignment.start import OWN_ZERO
 from skyquilt.errors import UsageError
 from skyquilt.geometry.transforms import Model
