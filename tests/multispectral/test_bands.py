@@ -15,11 +15,12 @@ from skyquilt.multispectral import captures
 from skyquilt.multispectral.captures import bands_of_files, captured_together
 from skyquilt.multispectral.draw import BandsDrawing, averaged
 from skyquilt.multispectral.indices import INDICES, indices_of
-from skyquilt.multispectral.placing import _far, _like, _weaker
+from skyquilt.multispectral.placing import _like, _weaker
 from skyquilt.multispectral.reflectance import common_kind
 from skyquilt.photos.band_tags import BandTags
 from skyquilt.photos.together import SECONDS, nearest_in_time
 from skyquilt.raster import Block
+from skyquilt.workflows.second_camera import far
 from tests.alignment.surveys import photo
 
 NOON = datetime(2024, 7, 15, 12)
@@ -172,8 +173,8 @@ def test_captures_on_the_way_up_do_not_tell_the_camera():
         ground=SimpleNamespace(surface=surface),
     )
     pairs = [(i, i) for i in poses]
-    assert _far(scene, pairs) == [(i, i) for i in (2, 3, 4, 5, 6)]
-    assert _far(scene, []) == []
+    assert far(scene, pairs) == [(i, i) for i in (2, 3, 4, 5, 6)]
+    assert far(scene, []) == []
 
 
 def test_few_blocks_of_many_bands_are_in_memory():

@@ -3,6 +3,7 @@ rotation.
 """
 
 import shutil
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -20,7 +21,7 @@ from skyquilt.settings import MosaicSettings
 from skyquilt.thermal import workflow
 from skyquilt.thermal.workflow import iter_thermal
 
-HEAT = Camera.ideal(width=320, height=256, focal=400.0)
+HEAT = replace(Camera.ideal(width=320, height=256, focal=400.0), k1=-0.2)
 TURN = cam_R_map_from_angles(2.0, 1.0, -1.5) @ cam_R_map_from_angles(0, 0, 0).T
 """thermal_R_visual."""
 SETTINGS = MosaicSettings(gsd_cm=15, jobs=2)
@@ -74,6 +75,7 @@ def test_the_rig_is_found_and_drawn_on_the_visual_poses(flight, frames, output):
     assert told["route"] == "rig" and told["photos_used"] == 9
     assert angle_deg(np.array(told["thermal_R_visual"]), TURN) < 0.05
     assert told["evidence"]["focal_px"] == pytest.approx(HEAT.focal, rel=0.01)
+    assert told["evidence"]["k1"] == pytest.approx(HEAT.k1, abs=0.03)  # no file tells it
     assert not (output / "thermal").exists()  # no map of its own was needed
     with rasterio.open(output / "thermal.tif") as out, rasterio.open(output / "mosaic.tif") as m:
         assert (out.transform, out.shape, out.crs) == (m.transform, m.shape, m.crs)

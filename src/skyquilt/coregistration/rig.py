@@ -11,7 +11,7 @@ differ, each along its flight: then one delay of the second camera explains them
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -76,6 +76,8 @@ class Rig:
     """Number of pairs used."""
     pairs: int
     """Number of pairs registered."""
+    a_t_b: Array = field(default_factory=lambda: np.zeros(3))
+    """(3,) where the second camera is, m along the axes of the first."""
     delay_s: float = 0.0
     """How much later than the first camera the second one is exposed, s; 0 where nothing tells."""
 

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.coregistration.band_rig import BandRig
 from skyquilt.engine.clock import Steps
 from skyquilt.engine.folder import STATE
 from skyquilt.engine.pixel_cache import PixelCache
@@ -23,11 +24,10 @@ from skyquilt.errors import PhotoFailedError
 from skyquilt.imaging.nodes import STEP, View
 from skyquilt.imaging.views import make_views, native_gsd
 from skyquilt.model.photo import Photo
-from skyquilt.model.poses import Alignment, Pose, no_ties
+from skyquilt.model.poses import Alignment, no_ties
 from skyquilt.model.raster import Window
 from skyquilt.multispectral.captures import BandFiles
 from skyquilt.multispectral.indices import Index
-from skyquilt.multispectral.rig import BandRig
 from skyquilt.ortho.blend import Blend
 from skyquilt.ortho.companions import geotransform
 from skyquilt.ortho.compose import Composer
@@ -37,6 +37,7 @@ from skyquilt.ortho.orthomosaic import keeper
 from skyquilt.photos.pixels import lost
 from skyquilt.raster import Block, CogWriter, RasterSpec
 from skyquilt.workflows.photo_features import pixels_again
+from skyquilt.workflows.second_camera import pose_beside
 
 BANDS_FILE = "bands.tif"
 _LARGER = 1.5
@@ -72,7 +73,7 @@ def aligned_band(band: PlacedBand, placed: Alignment) -> Alignment:
     of_photo = [i for i in band.of_photo if i in placed.poses]
     if not band.rigs:
         return replace(placed, poses={i: placed.poses[i] for i in of_photo})
-    poses = {i: _beside(placed.poses[i], band.rigs[i], band.velocities[i]) for i in of_photo}
+    poses = {i: pose_beside(placed.poses[i], band.rigs[i], band.velocities[i]) for i in of_photo}
     # by both cameras: a lens takes up what that of the map's photo leaves out
     name = {id(rig): f"{band.files.name} {n}" for n, rig in enumerate(band.rigs.values())}
     camera_of = {i: name[id(band.rigs[i])] for i in poses}
@@ -86,14 +87,6 @@ def aligned_band(band: PlacedBand, placed: Alignment) -> Alignment:
         blocks=(tuple(poses),),
         ties=no_ties(),
     )
-
-
-def _beside(pose: Pose, rig: BandRig, velocity: NDArray[np.float64]) -> Pose:
-    """The pose of the camera of a band, exposed when the rig has it, when the map's photo had this
-    one.
-    """
-    moved = rig.a_t_b @ pose.cam_R_map + rig.delay_s * velocity
-    return Pose(cam_R_map=rig.b_R_a @ pose.cam_R_map, map_C=pose.map_C + moved)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

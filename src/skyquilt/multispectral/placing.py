@@ -11,16 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.motion import velocities_of
+from skyquilt.coregistration.band_rig import BandRig, FindBandRig
 from skyquilt.engine.clock import Steps
 from skyquilt.engine.workers import Workers
-from skyquilt.imaging.grey import shrink, to_grey8
-from skyquilt.imaging.nodes import View
-from skyquilt.imaging.views import on_ground
 from skyquilt.model.camera import Camera
 from skyquilt.model.event import Note
 from skyquilt.model.photo import Photo, RejectedPhoto, evenly
 from skyquilt.model.registration import RefusedRegistration
-from skyquilt.multispectral.beside import Together
 from skyquilt.multispectral.captures import (
     THERMAL,
     BandFiles,
@@ -33,10 +30,9 @@ from skyquilt.multispectral.focus import relative_detail, typical, unsharp_notes
 from skyquilt.multispectral.panels import by_panels
 from skyquilt.multispectral.recorded import Recorded, look_at
 from skyquilt.multispectral.reflectance import KINDS, Kind, common_kind
-from skyquilt.multispectral.rig import BandRig, FindBandRig
 from skyquilt.photos.left_out import without_partner
-from skyquilt.photos.pixels import read_color
 from skyquilt.workflows.flow import AlignedPhotos, Scene
+from skyquilt.workflows.second_camera import far, together_of
 
 Velocity = NDArray[np.float64]
 """(3,) in m/s in the map frame."""
@@ -44,12 +40,6 @@ MOST_PAIRS = 6
 """Captures from which the camera of a band is found, distributed over the flight; each takes a
 quarter of a second.
 """
-LONGEST = 1600
-"""Longest side in px of the pictures that are compared."""
-_FAR = 0.6
-"""Share of the usual height above the ground from which a capture can tell the camera."""
-_PLACES = 65
-"""Places along a side of a photo at which the depth of the ground is looked up."""
 _FAR_PX = 1.0
 """Distance of a band from the map, in px of its own, that is told."""
 _SATURATED = 0.02
@@ -187,10 +177,12 @@ def _rig(
         return RefusedRegistration(
             reason="the map's photos have no adjusted poses; use --method bundle"
         )
-    pairs = _far(scene, pairs)
+    pairs = far(scene, pairs)
     asked = [pairs[k] for k in evenly(len(pairs), MOST_PAIRS)]
     seen = [
-        t for i, j in asked if (t := _together(scene, i, band.photos[j], velocities[i])) is not None
+        t
+        for i, j in asked
+        if (t := together_of(scene, i, band.photos[j], velocities[i])) is not None
     ]
     if not pairs:
         return FindBandRig()(seen, Camera.ideal(width=1, height=1, focal=1.0), 0.0)
@@ -209,51 +201,6 @@ def _like(first: Photo, other: Photo, found: Camera) -> Camera:
     if not alike or first.focal.source != other.focal.source or first.calibration is not None:
         return first.lens
     return replace(first.lens, focal=first.lens.focal * found.focal / other.focal.px)
-
-
-def _far(scene: Scene, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """The pairs without those taken on the way up or down: the few centimetres between cameras are
-    many pixels of near ground.
-    """
-    if not pairs:
-        return []
-    C = np.array([scene.aligned.alignment.poses[i].map_C for i, _ in pairs])
-    heights = C[:, 2] - scene.ground.surface.at(C[:, 0], C[:, 1])
-    far = heights > _FAR * np.median(heights)
-    return [pair for pair, used in zip(pairs, far, strict=True) if used]
-
-
-def _together(scene: Scene, index: int, other: Photo, velocity: Velocity) -> Together | None:
-    """Pictures of one capture; None where the band's file cannot be read."""
-    aligned = scene.aligned
-    try:
-        grey = to_grey8(read_color(other))
-    except Exception:  # whatever it is, it concerns this photo alone; told when it is drawn
-        return None
-    camera = aligned.alignment.camera(index)
-    return Together(
-        a=aligned.grey(index, LONGEST),
-        camera_a=camera,
-        b=shrink(grey, LONGEST)[0],
-        nearness=_nearness(scene, index),
-        velocity=aligned.alignment.poses[index].cam_R_map @ velocity,
-    )
-
-
-def _nearness(scene: Scene, index: int) -> NDArray[np.float64]:
-    """(r, c) 1 over the depth in m of the ground in a photo of the map, at places from corner to
-    corner; 0 where its rays meet none.
-    """
-    alignment, camera = scene.aligned.alignment, scene.aligned.alignment.camera(index)
-    pose = alignment.poses[index]
-    x, y = np.meshgrid(
-        np.linspace(0, camera.width - 1, _PLACES), np.linspace(0, camera.height - 1, _PLACES)
-    )
-    view = View(photo=index, camera=camera, pose=pose, footprint=np.zeros((0, 2)))
-    ground = on_ground(view, np.c_[x.ravel(), y.ravel()], scene.ground.surface)
-    depth = ((ground - pose.map_C) @ pose.cam_R_map[2]).reshape(x.shape)
-    with np.errstate(divide="ignore"):
-        return np.asarray(np.where(depth > 0, 1 / depth, 0.0))
 
 
 def _comparable(placed: Sequence[PlacedBand]) -> tuple[list[PlacedBand], Kind, list[str]]:

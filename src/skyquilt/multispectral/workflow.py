@@ -11,6 +11,7 @@ from collections.abc import Generator, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from skyquilt.coregistration.band_rig import FindBandRig
 from skyquilt.engine.clock import Clock, result_of
 from skyquilt.engine.folder import ADDED, STATE, THERMAL_FILE, as_written, stamps
 from skyquilt.engine.pixel_cache import pixel_budget
@@ -26,7 +27,6 @@ from skyquilt.multispectral.page import band_figures, write_section
 from skyquilt.multispectral.panels import by_panels
 from skyquilt.multispectral.placing import Placing, place_bands
 from skyquilt.multispectral.reflectance import Kind
-from skyquilt.multispectral.rig import FindBandRig
 from skyquilt.outside import remove_file
 from skyquilt.photos.headers import content_digest
 from skyquilt.photos.left_out import told_left_out

@@ -1,14 +1,17 @@
 """Thermal photos placed by the poses and the surface of visual photos taken by the same drone."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from skyquilt.alignment.motion import velocities_of
+from skyquilt.coregistration.band_rig import FindBandRig
+from skyquilt.coregistration.beside import Beside
 from skyquilt.coregistration.pictures import guess_of, open_picture
 from skyquilt.coregistration.rig import FindRig, Rig, RigPair
 from skyquilt.coregistration.workflow import outcome_of
@@ -18,8 +21,8 @@ from skyquilt.imaging.grey import shrink
 from skyquilt.imaging.nodes import View
 from skyquilt.imaging.views import make_views, on_ground
 from skyquilt.model.event import Note
-from skyquilt.model.photo import Photo, RejectedPhoto, Survey
-from skyquilt.model.poses import Alignment, Pose, no_ties
+from skyquilt.model.photo import Photo, RejectedPhoto, Survey, evenly
+from skyquilt.model.poses import Alignment, no_ties
 from skyquilt.model.raster import Window
 from skyquilt.model.registration import RefusedRegistration, Registration
 from skyquilt.ortho.blend import Blend
@@ -36,6 +39,7 @@ from skyquilt.raster import CogWriter, RasterSpec
 from skyquilt.settings import PictureSettings
 from skyquilt.workflows.flow import Scene
 from skyquilt.workflows.photo_features import THUMBNAIL, pixels_again
+from skyquilt.workflows.second_camera import far, pose_beside, together_of
 
 MOST_PAIRS = 12
 """Largest number of pairs registered, distributed over the flight; each takes one or two
@@ -45,6 +49,8 @@ KNOWN_FOCAL = 0.01
 """The thermal focal length is not estimated if its relative standard deviation is below this."""
 _AGREE = 0.75
 """Share of registered pairs below which it is told that others do not agree with them."""
+_TOLD_S = 0.05
+"""Delay of the thermal camera that is told, s."""
 _GRID = 6
 """Points per side of the grid from which the rotation of a registered pair is computed."""
 
@@ -103,15 +109,17 @@ def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistrati
         return RefusedRegistration(
             reason=f"the thermal photos are from {len(kinds)} cameras or formats"
         )
-    asked = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, MOST_PAIRS).astype(int))]
+    asked = [pairs[k] for k in evenly(len(pairs), MOST_PAIRS)]
     velocity = velocities_of(visual, placed)
     seen = [
         p for i, j in asked if (p := _registered(scene, i, thermal[j], velocity[i])) is not None
     ]
     rig = FindRig(free=_freedom(first))(seen, first.lens)
+    if isinstance(rig, Rig) or len(seen) < FindRig.minimum:  # else pairs contradict each other
+        rig = _with_lens(scene, thermal, pairs, velocity, rig)
     if isinstance(rig, RefusedRegistration):
         return rig
-    poses = {k: _turned(placed.poses[i], velocity[i], rig) for k, (i, _) in enumerate(pairs)}
+    poses = {k: pose_beside(placed.poses[i], rig, velocity[i]) for k, (i, _) in enumerate(pairs)}
     alignment = Alignment(
         method="rig",
         why="both cameras were on the same drone",
@@ -124,6 +132,42 @@ def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistrati
     )
     photos = tuple(thermal[j] for _, j in pairs)
     return Rigged(rig=rig, photos=photos, alignment=alignment, rejected=(*bad.values(), *alone))
+
+
+def _with_lens(
+    scene: Scene,
+    thermal: Sequence[Photo],
+    pairs: Sequence[tuple[int, int]],
+    velocity: Mapping[int, NDArray[np.float64]],
+    rig: Rig | RefusedRegistration,
+) -> Rig | RefusedRegistration:
+    """The rig with the lens of the thermal camera, from patches of pairs (index of the visual
+    photo, of the thermal one); `rig`: what whole pictures tell, which is kept where patches tell
+    nothing. A strong lens keeps these from being registered by a homography.
+    """
+    first, near = thermal[pairs[0][1]], None
+    pairs = far(scene, pairs)
+    asked = [pairs[k] for k in evenly(len(pairs), MOST_PAIRS)]
+    seen = [t for i, j in asked if (t := together_of(scene, i, thermal[j], velocity[i]))]
+    if isinstance(rig, Rig):
+        turn = np.asarray(Rotation.from_matrix(rig.b_R_a).as_rotvec())
+        near = Beside(turn=turn, place=rig.a_t_b[:2], camera=rig.camera_b, delay_s=rig.delay_s)
+    found = FindBandRig()(seen, first.lens, first.focal.sigma_px / first.focal.px, near)
+    if isinstance(found, RefusedRegistration):
+        return rig
+    if isinstance(rig, RefusedRegistration):
+        agreeing, among, spread_deg = found.agreeing, found.pairs, 0.0
+    else:
+        agreeing, among, spread_deg = rig.agreeing, rig.pairs, rig.spread_deg
+    return Rig(
+        b_R_a=found.b_R_a,
+        a_t_b=found.a_t_b,
+        camera_b=found.camera,
+        delay_s=found.delay_s,
+        agreeing=agreeing,
+        pairs=among,
+        spread_deg=spread_deg,
+    )
 
 
 def _undecodable(photo: Photo) -> RejectedPhoto | None:
@@ -142,10 +186,6 @@ def _freedom(photo: Photo) -> float:
     if photo.calibration is not None or photo.focal.sigma_px < KNOWN_FOCAL * photo.focal.px:
         return 0.0
     return float(min(3 * photo.focal.sigma_px / photo.focal.px, 1.0))
-
-
-def _turned(pose: Pose, velocity: NDArray[np.float64], rig: Rig) -> Pose:
-    return Pose(cam_R_map=rig.b_R_a @ pose.cam_R_map, map_C=pose.map_C + rig.delay_s * velocity)
 
 
 def _registered(
@@ -247,7 +287,7 @@ def rig_notes(found: Rigged) -> list[Note]:
             " of the visual ones; --thermal-route maps uses the others, too"
         )
         notes.append(Note(text=text, warning=True))
-    if rig.delay_s:
+    if abs(rig.delay_s) > _TOLD_S:
         when = f"{abs(rig.delay_s):.2f} s {'later' if rig.delay_s > 0 else 'earlier'}"
         text = (
             f"thermal photos were taken {when} than the visual ones beside them, by what both show;"
@@ -279,6 +319,7 @@ def rig_figures(found: Rigged, thermal: Survey) -> dict[str, Any]:
             "pairs_agreeing": rig.agreeing,
             "spread_deg": round(rig.spread_deg, 4),
             "focal_px": round(rig.camera_b.focal, 2),
+            "k1": round(rig.camera_b.k1, 4),
             "delay_s": round(rig.delay_s, 3),
         },
         "thermal_R_visual": rig.b_R_a.tolist(),

@@ -89,6 +89,7 @@ _EVIDENCE = {
     "spread_deg": "spread of the pairs' rotations, degrees",
     "delay_s": "thermal photos taken later than visual ones by, s",
     "focal_px": "thermal focal length, px",
+    "k1": "thermal lens, k1",
     "cells": "cells of heights compared",
     "residual_m": "robust standard deviation of the height differences, m",
     "halves_apart_m": "distance between the independent solutions of two halves of the ground, m",

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.coregistration.band_rig import FindBandRig
 from skyquilt.coregistration.files import overlays, resample_onto
 from skyquilt.coregistration.pictures import Source
 from skyquilt.coregistration.rig import FindRig
@@ -149,7 +150,7 @@ def _key(
     program.
     """
     maps = [run_key(given, wanted, methods_for(wanted)) for given, wanted in (visual, thermal)]
-    return digest(*maps, route, (join, rigged, draw_rigged), __version__)
+    return digest(*maps, route, (FindRig(), FindBandRig(), join, rigged, draw_rigged), __version__)
 
 
 def _without_clips(heats: SurveyInput, folder: Path) -> tuple[SurveyInput, str]:

@@ -1,5 +1,5 @@
-"""The cameras of a multispectral rig relative to each other: a rotation, a place and a lens for
-each band.
+"""The cameras of a rig relative to each other: a rotation, a place and a lens for each band of a
+multispectral camera, or for the thermal camera beside the visual one.
 
 All cameras of a rig are a few centimetres apart and see the same ground, so that the pixels of two
 photos of one trigger correspond by a rotation, by the place of one camera beside the other and by
@@ -23,13 +23,13 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from skyquilt.coregistration.agreement import scores, summit
+from skyquilt.coregistration.beside import Beside, Together, oriented, padded, seen_by, turned
 from skyquilt.coregistration.orientation import Orientation
 from skyquilt.geometry.camera import rays
 from skyquilt.imaging.grey import full_px
 from skyquilt.model.camera import Camera
 from skyquilt.model.photo import evenly
 from skyquilt.model.registration import RefusedRegistration
-from skyquilt.multispectral.beside import Beside, Together, oriented, padded, seen_by, turned
 
 Array = NDArray[np.float64]
 _ACROSS = 10
@@ -57,6 +57,8 @@ class BandRig:
     """How much later than the map's photos it is exposed, s; 0 where nothing tells."""
     pairs: int
     """Pairs of photos from which it was found."""
+    agreeing: int
+    """Those in which enough patches agree with it."""
     patches: int
     """Patches that agree with it."""
     share: float
@@ -106,6 +108,10 @@ class FindBandRig:
     """Sides of a patch between neighbours, at most."""
     share: tuple[float, ...] = (0.5, 0.5, 0.5, 1.0)
     """Share of the pairs that are matched: what a round finds, the next ones improve."""
+    bends: tuple[float, ...] = (0.0, -0.2, -0.4)
+    """What k1 of the lens may be beside what is known of it, for a first round: what a lens bends
+    by more than the reach at the rim is not matched there, and is not missed.
+    """
     scatter_px: float = 0.3
     """Scatter of a match in px of a reduced photo, beyond which its weight falls."""
     agree_px: float = 1.0
@@ -127,15 +133,19 @@ class FindBandRig:
     """Share of the largest velocity by which that of a pair must differ from the mean of all along
     the axes of the camera for a delay to be told from a rotation.
     """
-    version: ClassVar[int] = 5
+    version: ClassVar[int] = 6
 
     def __call__(
-        self, pairs: Sequence[Together], camera_b: Camera, sigma_focal: float
+        self,
+        pairs: Sequence[Together],
+        camera_b: Camera,
+        sigma_focal: float,
+        start: Beside | None = None,
     ) -> BandRig | RefusedRegistration:
         """The rig, or the reason why there is none.
 
         `camera_b` is what the files tell of the band's camera, `sigma_focal` the relative standard
-        deviation of its focal length.
+        deviation of its focal length; `start`: where it is nearly, if that is known.
         """
         if len(pairs) < self.minimum:
             return RefusedRegistration(
@@ -144,10 +154,10 @@ class FindBandRig:
             )
         straight = Beside(turn=np.zeros(3), place=np.zeros(2), camera=camera_b)
         fields = cache(lambda k, side: oriented(pairs[k].b, side))
-        best = self._from(straight, pairs, fields, sigma_focal)
-        if best is None or np.median(best[2]) > self.sure_px:
-            other = self._from(turned(pairs, straight), pairs, fields, sigma_focal)
-            if other is not None and (best is None or np.median(other[2]) < np.median(best[2])):
+        best = self._from(start or straight, camera_b, pairs, fields, sigma_focal)
+        if start is None and (best is None or np.median(best[2]) > self.sure_px):
+            other = self._from(turned(pairs, straight), camera_b, pairs, fields, sigma_focal)
+            if other is not None and (best is None or self._agree(other[2]) > self._agree(best[2])):
                 best = other
         if best is None:
             return RefusedRegistration(reason="its photos and the map's have nothing in common")
@@ -164,6 +174,10 @@ class FindBandRig:
             camera=there.camera,
             delay_s=there.delay_s,
             pairs=len(pairs),
+            agreeing=sum(
+                bool(agree[found.pair == k].mean() >= self.least_share)
+                for k in np.unique(found.pair)
+            ),
             patches=int(agree.sum()),
             share=float(agree.mean()),
             off_px=self._kept_out(found, there, camera_b, sigma_focal),
@@ -180,6 +194,7 @@ class FindBandRig:
     def _from(
         self,
         there: Beside,
+        told: Camera,
         pairs: Sequence[Together],
         fields: Callable[[int, int], Orientation],
         sigma_focal: float,
@@ -188,18 +203,29 @@ class FindBandRig:
         they are off in px of a reduced photo; None where none were matched. `fields`: those of the
         band's photo of a pair, reduced to a side.
         """
-        told, late = there.camera, self._ways_differ(pairs)
-        rounds = zip(self.sides, self.reach, self.apart, strict=True)
-        for step, (side, reach, apart) in enumerate(rounds):
+        late, starts = self._ways_differ(pairs), [_bent(there, k1) for k1 in self.bends]
+        for step, (side, reach, apart) in enumerate(
+            zip(self.sides, self.reach, self.apart, strict=True)
+        ):
             share = 1.0 if late else self.share[step]  # of all ways that are flown
             few = evenly(len(pairs), max(self.minimum, ceil(share * len(pairs))))
             seen = [(k, pairs[k], fields(k, side)) for k in few]
-            found = self._matched(seen, there, reach, apart)
-            if not len(found.px_a):
+            best: tuple[Beside, _Matched, Array] | None = None
+            for start in starts:
+                found = self._matched(seen, start, reach, apart)
+                if len(found.px_a):
+                    fits = self._fitted(found, start, told, step, sigma_focal, late)
+                    off = np.nan_to_num(_off(found, fits) / _scale(told, side), nan=np.inf)
+                    if best is None or self._agree(off) > self._agree(best[2]):
+                        best = fits, found, off
+            if best is None:
                 return None
-            there = self._fitted(found, there, told, step, sigma_focal, late)
-        off = _off(found, there) / _scale(told, self.sides[-1])
-        return there, found, np.nan_to_num(off, nan=np.inf)
+            starts = [best[0]]
+        return best
+
+    def _agree(self, off: Array) -> int:
+        """How many patches, off by px (n,) of a reduced photo, agree with a rig."""
+        return int((off < self.agree_px).sum())
 
     def _matched(
         self,
@@ -251,7 +277,7 @@ class FindBandRig:
         def camera(x: Array) -> Beside:
             changed: dict[str, Any] = dict(zip(free, map(float, x[6:]), strict=True))
             lens = replace(start.camera, **changed)
-            delay = float(x[5]) if late else 0.0
+            delay = float(x[5]) if late else start.delay_s
             return Beside(turn=x[:3], place=x[3:5], camera=lens, delay_s=delay)
 
         def misfit(x: Array) -> Array:
@@ -280,6 +306,11 @@ class FindBandRig:
                 late = there.delay_s != 0
                 off.append(_off(part, self._fitted(rest, there, told, step, sigma_focal, late)))
         return float(np.median(np.concatenate(off))) if off else float("nan")
+
+
+def _bent(there: Beside, k1: float) -> Beside:
+    """The camera with another k1 by so much."""
+    return replace(there, camera=replace(there.camera, k1=there.camera.k1 + k1))
 
 
 def _deviations(told: Camera, sigma_focal: float) -> dict[str, float]:

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from skyquilt.coregistration.band_rig import BandRig, FindBandRig
+from skyquilt.coregistration.beside import Together
 from skyquilt.coregistration.orientation import orientation
 from skyquilt.geometry.camera import project, rays
 from skyquilt.geometry.frames import rotation_from_vector
 from skyquilt.model.camera import Camera
 from skyquilt.model.registration import RefusedRegistration
-from skyquilt.multispectral.beside import Together
-from skyquilt.multispectral.rig import BandRig, FindBandRig
-from tests.multispectral.rigs import BandCamera, rig, seen
+from tests.coregistration.rigs import BandCamera, rig, seen
 from tests.texture import texture
 
 WIDE = Camera.ideal(width=900, height=700, focal=760.0)
@@ -106,6 +106,17 @@ def test_a_knocked_lens_is_found():
     found = FindBandRig()(captures(a, b), b.camera, 0.01)
     assert isinstance(found, BandRig)
     assert np.median(apart_px(found, a, b, a.camera)) < 0.1
+
+
+@pytest.mark.slow
+def test_a_lens_that_bends_the_rim_beyond_reach_is_found():
+    """Thermal lenses have a k1 of -0.1 to -0.4, which no file tells: 30 px in the corners."""
+    a, b = rig(2, *SIZE, FOCAL)
+    bent = replace(b.camera, k1=-0.38, k2=0.12)
+    found = FindBandRig()(captures(a, replace(b, camera=bent)), replace(b.camera, k1=0, k2=0), 0.01)
+    assert isinstance(found, BandRig) and found.camera.k1 == pytest.approx(-0.38, abs=0.02)
+    off = apart_px(found, a, replace(b, camera=bent), a.camera)
+    assert np.median(off) < 0.1 and np.percentile(off, 95) < 0.3
 
 
 @pytest.mark.slow

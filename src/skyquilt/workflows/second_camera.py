@@ -1,0 +1,81 @@
+"""Photos of a second camera beside those of the map: both pictures of one trigger, with what the
+map knows of the ground and of the flight.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.coregistration.band_rig import BandRig
+from skyquilt.coregistration.beside import Together
+from skyquilt.coregistration.rig import Rig
+from skyquilt.imaging.grey import shrink, to_grey8
+from skyquilt.imaging.nodes import View
+from skyquilt.imaging.views import on_ground
+from skyquilt.model.photo import Photo
+from skyquilt.model.poses import Pose
+from skyquilt.photos.pixels import read_color
+from skyquilt.workflows.flow import Scene
+
+LONGEST = 1600
+"""Longest side in px of the pictures that are compared."""
+_FAR = 0.6
+"""Share of the usual height above the ground from which a capture can tell the camera."""
+_PLACES = 65
+"""Places along a side of a photo at which the depth of the ground is looked up."""
+
+
+def far(scene: Scene, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    """The pairs without those taken on the way up or down: the few centimetres between cameras are
+    many pixels of near ground.
+    """
+    if not pairs:
+        return []
+    C = np.array([scene.aligned.alignment.poses[i].map_C for i, _ in pairs])
+    heights = C[:, 2] - scene.ground.surface.at(C[:, 0], C[:, 1])
+    high = heights > _FAR * np.median(heights)
+    return [pair for pair, used in zip(pairs, high, strict=True) if used]
+
+
+def pose_beside(pose: Pose, rig: Rig | BandRig, velocity: NDArray[np.float64]) -> Pose:
+    """The pose of the second camera, exposed when the rig has it, when the map's photo had this
+    one; `velocity` (3,) of the latter, m/s in the map frame.
+    """
+    moved = rig.a_t_b @ pose.cam_R_map + rig.delay_s * velocity
+    return Pose(cam_R_map=rig.b_R_a @ pose.cam_R_map, map_C=pose.map_C + moved)
+
+
+def together_of(
+    scene: Scene, index: int, other: Photo, velocity: NDArray[np.float64]
+) -> Together | None:
+    """Pictures of one capture; None where its file cannot be read."""
+    aligned = scene.aligned
+    try:
+        grey = to_grey8(read_color(other))
+    except Exception:  # whatever it is, it concerns this photo alone; told when it is drawn
+        return None
+    camera = aligned.alignment.camera(index)
+    return Together(
+        a=aligned.grey(index, LONGEST),
+        camera_a=camera,
+        b=shrink(grey, LONGEST)[0],
+        nearness=_nearness(scene, index),
+        velocity=aligned.alignment.poses[index].cam_R_map @ velocity,
+    )
+
+
+def _nearness(scene: Scene, index: int) -> NDArray[np.float64]:
+    """(r, c) 1 over the depth in m of the ground in a photo of the map, at places from corner to
+    corner; 0 where its rays meet none.
+    """
+    alignment, camera = scene.aligned.alignment, scene.aligned.alignment.camera(index)
+    pose = alignment.poses[index]
+    x, y = np.meshgrid(
+        np.linspace(0, camera.width - 1, _PLACES), np.linspace(0, camera.height - 1, _PLACES)
+    )
+    view = View(photo=index, camera=camera, pose=pose, footprint=np.zeros((0, 2)))
+    ground = on_ground(view, np.c_[x.ravel(), y.ravel()], scene.ground.surface)
+    depth = ((ground - pose.map_C) @ pose.cam_R_map[2]).reshape(x.shape)
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.where(depth > 0, 1 / depth, 0.0))
