@@ -112,6 +112,15 @@ def test_a_new_photo_says_how_well_it_is_known(former, grown):
         assert (grown.poses[i].sigma_m < 4 * known).all()
 
 
+def test_the_accuracy_is_told_alike_of_all_parts(flown, grown):
+    """Of the part that was adjusted, no more places than of as much ground elsewhere."""
+    whole = METHOD(flown.photos, FRAME, flown.priors, flown.features, flown.links)
+    centre = np.mean([whole.poses[i].map_C[:2] for i in NEW], axis=0)
+    reach = np.ptp([p.map_C[:2] for p in whole.poses.values()], axis=0).max() / 3
+    near = [np.hypot(*(a.accuracy.xyz[:, :2] - centre).T) < reach for a in (grown, whole)]
+    assert near[0].mean() == pytest.approx(near[1].mean(), rel=0.25)
+
+
 def test_nothing_new_changes_nothing(flown):
     whole = METHOD(flown.photos, FRAME, flown.priors, flown.features, flown.links)
     again = added(inputs(flown, whole), METHOD)

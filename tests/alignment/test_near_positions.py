@@ -93,6 +93,23 @@ def test_their_headings_tell_where_north_is():
     assert off(survey, told_besides(turned, some, 0.0))[1] == pytest.approx(30, abs=1.5)
 
 
+def test_why_positions_tell_little_is_said_as_it_is():
+    """Photos far from each other of which one or two have a position were not taken near to each
+    other.
+    """
+    survey = flown(SQUARE, 1)
+    found = replace(adjusted(survey), notes=())
+    bare = [replace(p, map_C=np.full(3, np.nan)) for p in survey.priors]
+    for count, why in (
+        (1, "Only one photo of the map"),
+        (2, "The 2 photos that"),
+        (4, "The photos "),
+    ):
+        priors = [*survey.priors[:count], *bare[count:]]
+        notes = told_besides(found, priors, 0.0).notes
+        assert notes and all(note.startswith(why) for note in notes)
+
+
 def test_positions_that_tell_scale_and_direction_are_not_touched():
     for survey in (flown(WIDE, 0), flown(SQUARE, 0, gps=0.02, height_off=9.0)):
         found = adjusted(survey)

@@ -27,6 +27,8 @@ from skyquilt.live.photo_intake import Intake, Refused
 from skyquilt.live.settings import LiveSettings
 from skyquilt.live.workflow import iter_live
 from skyquilt.model.event import Note
+from skyquilt.server.access import Guard
+from skyquilt.server.uploads import Uploads
 from tests.attacks import SHARED, jpeg, needs_attacks
 from tests.live.clock import Clock
 
@@ -429,6 +431,51 @@ def test_a_folder_of_the_survey_that_is_removed_is_told_on_the_page_too(flight, 
     assert note.warning and "is gone: no photo is accepted until it is back" in note.text
     told = live.ledger.rows("select body from event where kind = 'note'")
     assert [json.loads(body)["text"] for (body,) in told] == [note.text]
+    live.close()
+
+
+def test_no_photo_is_lost_while_the_survey_is_elsewhere(flight, tmp_path):
+    """Its folder is moved away and back: what was accepted is placed then, what comes meanwhile is
+    not refused, and the place stays free.
+    """
+    live, gone = LiveMap(tmp_path / "out", QUICK), "is gone: no photo is accepted until"
+    uploads = Uploads(live.folder / "uploads", Guard())
+    live.intake.take_file(flight.photos[0], "")
+    live.folder.rename(tmp_path / "away")
+    for _ in range(2):  # the second time all is read again from the database
+        with pytest.raises(OutputError, match=gone):
+            live.work()
+    with pytest.raises(OutputError, match=gone):
+        live.intake.take_file(flight.photos[1], "")
+    with pytest.raises(OutputError):
+        live.store.put("features", "0", [1])
+    with pytest.raises(FileNotFoundError):
+        uploads.begin("a.jpg", "phone", 9)
+    assert not live.folder.exists()
+    (tmp_path / "away").rename(live.folder)
+    list(live.drain_all())
+    assert live.ledger.counts() == {"placed": 1, "refused": 0}
+    live.close()
+
+
+def test_a_photo_that_is_stored_while_the_survey_is_moved_is_not_refused(
+    flight, tmp_path, monkeypatch
+):
+    live = LiveMap(tmp_path / "out", QUICK)
+    bring = live.inbox.bring
+
+    def brought(blocks):
+        arrived = bring(blocks)
+        live.folder.rename(tmp_path / "away")
+        return arrived
+
+    monkeypatch.setattr(live.inbox, "bring", brought)
+    with pytest.raises(OutputError, match="is gone: no photo is accepted until it is back"):
+        live.intake.take_file(flight.photos[0], "")
+    (tmp_path / "away").rename(live.folder)
+    assert live.ledger.counts()["refused"] == 0
+    monkeypatch.undo()
+    assert live.intake.take_file(flight.photos[0], "")
     live.close()
 
 

@@ -23,6 +23,7 @@ from skyquilt.alignment.setup import Setup, camera_records, pose_records
 from skyquilt.alignment.stages import fine, prune, weighed
 from skyquilt.alignment.tracks import Tracks, build_tracks, thin
 from skyquilt.alignment.triangulate import triangulated
+from skyquilt.geometry.neighbours import nearest
 from skyquilt.model.camera import Camera
 from skyquilt.model.features import Link
 from skyquilt.model.poses import Accuracy, Alignment, ControlResidual, Pose, Prior, TiePoints
@@ -117,6 +118,7 @@ def adjusted_near(
     if _misfit(found, base.ties, numbers[tracks.photo], placed):
         return None
     keys = None if full is None else full.camera_sigmas
+    own = None if full is None else accuracy(setup, problem, state, full)
     cameras, camera_of = camera_records(window.photos, setup, state, keys)
     poses = pose_records(setup, state, _sigmas(full, base, held))
     kept = {members[k]: p for k, p in poses.items() if members[k] in moving}
@@ -135,7 +137,7 @@ def adjusted_near(
         blocks=tuple(tuple(b) for b in grown),
         ties=_merged(base.ties, found, moving),
         control=_checked(base, control, setup, problem, state, full),
-        accuracy=_accuracy(base, setup, problem, state, full, held),
+        accuracy=_accuracy(base, own, found, moving),
     )
 
 
@@ -233,9 +235,7 @@ def _stays(base: Alignment, photo: int, pose: Pose, ties: TiePoints) -> bool:
 
 def _merged(former: TiePoints, found: TiePoints, moving: set[int]) -> TiePoints:
     """The points that no moving photo shows, and those found by the adjustment."""
-    touched = np.zeros(len(former.xyz), np.bool_)
-    touched[former.point[np.isin(former.photo, list(moving))]] = True
-    keep = ~touched[former.point]
+    keep = ~_shown(former, moving)[former.point]
     points, renumbered = np.unique(former.point[keep], return_inverse=True)
     return TiePoints(
         xyz=np.concatenate([former.xyz[points], found.xyz]),
@@ -244,6 +244,13 @@ def _merged(former: TiePoints, found: TiePoints, moving: set[int]) -> TiePoints:
         px=np.concatenate([former.px[keep], found.px]),
         residual_px=np.concatenate([former.residual_px[keep], found.residual_px]),
     )
+
+
+def _shown(ties: TiePoints, photos: set[int]) -> NDArray[np.bool_]:
+    """(P,) whether any of these photos shows a point."""
+    shown = np.zeros(len(ties.xyz), np.bool_)
+    shown[ties.point[np.isin(ties.photo, list(photos))]] = True
+    return shown
 
 
 def _checked(
@@ -266,22 +273,24 @@ def _checked(
 
 
 def _accuracy(
-    base: Alignment,
-    setup: Setup,
-    problem: Problem,
-    state: State,
-    full: Covariance | None,
-    held: set[int],
+    base: Alignment, own: Accuracy | None, found: TiePoints, moving: set[int]
 ) -> Accuracy | None:
-    """The predicted accuracy with that of the window's ground points, which hang on the others."""
-    if base.accuracy is None or full is None:
-        return base.accuracy
-    own = accuracy(setup, problem, state, full)
-    centre = np.array([base.poses[i].map_C[:2] for i in sorted(held)]).mean(0)
-    near = np.argsort(np.hypot(*(base.accuracy.xyz[:, :2] - centre).T))[:20]
-    there = np.median(base.accuracy.sigma_m[near], axis=0)
+    """The predicted accuracy with that of the window's ground points (`own`), which hang on the
+    block as it is there: they take the place of those that moving photos show, as many of them as
+    elsewhere.
+    """
+    told = base.accuracy
+    if told is None or own is None or not len(told.xyz):
+        return told
+    wanted = len(found.xyz) * len(told.xyz) / len(base.ties.xyz)
+    each = max(1, round(len(own.xyz) / max(wanted, 1.0)))
+    xyz = own.xyz[::each]
+    _, near = nearest(told.xyz[:, :2], xyz[:, :2], min(20, len(told.xyz)))
+    sigma = np.hypot(own.sigma_m[::each], np.median(told.sigma_m[near], axis=1))
+    _, at = nearest(base.ties.xyz, told.xyz, 1)
+    stays = ~_shown(base.ties, moving)[at[:, 0]]
     return replace(
-        base.accuracy,
-        xyz=np.concatenate([base.accuracy.xyz, own.xyz]),
-        sigma_m=np.concatenate([base.accuracy.sigma_m, np.hypot(own.sigma_m, there)]),
+        told,
+        xyz=np.concatenate([told.xyz[stays], xyz]),
+        sigma_m=np.concatenate([told.sigma_m[stays], sigma]),
     )

@@ -149,10 +149,9 @@ def _scale(
             " higher or lower, or the map is too large or small. Control points would tell."
         )
     return _Told(
-        f"The photos were taken so near to each other that their positions tell the map's scale to"
-        f" {min(100 * loose[0], 100):.0f} % only. So it rests on heights above take-off, too, which"
-        " tell it where the ground is as high as the place of take-off. Control points would"
-        " settle it.",
+        f"{_known(found, held, 'scale', f'{min(100 * loose[0], 100):.0f} %')}. So it rests on"
+        " heights above take-off, too, which tell it where the ground is as high as the place of"
+        " take-off. Control points would settle it.",
         *to,
     )
 
@@ -171,7 +170,19 @@ def _heading(found: Alignment, priors: Sequence[Prior], held: Sequence[int]) -> 
     if to is None:
         return None  # told for each photo (`alignment.conflicts`)
     return _Told(
-        f"The photos were taken so near to each other that their positions tell the map's"
-        f" direction to {min(loose[0], 180):.0f} degrees only. So it rests on their headings, too.",
+        f"{_known(found, held, 'direction', f'{min(loose[0], 180):.0f} degrees')}. So it rests on"
+        " their headings, too.",
         float(np.radians(to[0])),
+    )
+
+
+def _known(found: Alignment, held: Sequence[int], what: str, to: str) -> str:
+    """How well positions tell something of the map, and why; `held`: the photos that have one."""
+    if len(held) == 1:
+        return f"Only one photo of the map has a position, which tells nothing of its {what}"
+    all_of = len(held) == len(found.held)
+    whose = "The photos" if all_of else f"The {len(held)} photos that have a position"
+    return (
+        f"{whose} were taken so near to each other that their positions tell the map's {what} to"
+        f" {to} only"
     )

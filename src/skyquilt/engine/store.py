@@ -194,6 +194,10 @@ class Store:
     """The folder."""
     registry: Registry
     """Record types that may be stored."""
+    within: Path | None = None
+    """A folder around it that is never made anew: what was moved away for a while shall find its
+    place free.
+    """
     hits: int = 0
     """Number of results found."""
     misses: int = 0
@@ -224,7 +228,7 @@ class Store:
         """Stores a result atomically: the file appears complete or not at all.
 
         Raises:
-            OutputError: the disk is full or the folder read-only.
+            OutputError: the disk is full or the folder read-only, or that around it is gone.
         """
         self.misses += 1
         path = self.folder / stage / f"{key}.npz"
@@ -232,6 +236,8 @@ class Store:
         maker = f"{platform.node()}-{os.getpid()}-{threading.get_ident()}"
         partial = path.with_suffix(f".{maker}.partial")
         try:
+            if self.within is not None:
+                self.within.stat()
             path.parent.mkdir(parents=True, exist_ok=True)
             with partial.open("wb") as file:
                 write(file, value)

@@ -110,9 +110,8 @@ def adjust_block(job: AdjustmentJob) -> BlockAdjustment:
             links = _links(job, ledger)
         finally:
             ledger.close()
-        store = Store(
-            folder=job.store, registry={c.__name__: c for c in (PhotoFeatures, Features, Surface)}
-        )
+        registry = {c.__name__: c for c in (PhotoFeatures, Features, Surface)}
+        store = Store(folder=job.store, registry=registry, within=job.folder)
         features = [_features(p, store, job.methods) for p in job.photos]
         done = _part(job, links, features) if job.held else _whole(job, links, features, store)
         return replace(done, before=job.poses)

@@ -82,7 +82,8 @@ def _looked(path: Path, name: str, intake: Intake) -> Generator[None, None, Surv
     clip, such as that its positions were not used, is told to viewers once.
     """
     settings = InputSettings()
-    store = Store(folder=intake.inbox.folder.parent / SEEN, registry=REGISTRY)
+    home = intake.inbox.folder.parent
+    store = Store(folder=home / SEEN, registry=REGISTRY, within=home)
     given = read_input(path, settings)
     clips = tuple(replace(c, name=name) for c in given.survey.clips)
     steps = with_frames(replace(given, survey=replace(given.survey, clips=clips)), settings, store)

@@ -120,6 +120,13 @@ class Inbox:
             raise
         return Arrived(path=path, digest=digest.hexdigest(), size=size, anew=anew)
 
+    def check(self) -> None:
+        """Raises OutputError where the folder is gone: that a file in it cannot be read then tells
+        nothing of its photo.
+        """
+        if not is_folder(self.folder):
+            raise OutputError(_gone(self.folder))
+
 
 def _read(blocks: Iterable[bytes]) -> Iterator[bytes]:
     """The blocks; an error of reading is told from one of writing."""
@@ -159,8 +166,12 @@ def _refusal(folder: Path, error: OSError) -> OutputError:
             f"the disk is full: {folder} cannot take another photo. Make room and send it again"
         )
     if not is_folder(folder):
-        return OutputError(
-            f"{folder} is gone: no photo is accepted until it is back. If it was removed, end the"
-            " live map and start it again"
-        )
+        return OutputError(_gone(folder))
     return OutputError(f"cannot write to {folder}: {error.strerror or error}")
+
+
+def _gone(folder: Path) -> str:
+    return (
+        f"{folder} is gone: no photo is accepted until it is back. If it was removed, end the live"
+        " map and start it again"
+    )

@@ -97,7 +97,8 @@ class LiveMap:
         self.tiles = TileStore(self.folder / TILES, write=True)
         self.methods = methods_for(MosaicSettings(features=self.settings.features))
         registry = {c.__name__: c for c in (PhotoFeatures, features.Features, poses.Pose)}
-        self.store = Store(folder=self.folder / STORE, registry=registry)
+        store = self.folder / STORE
+        self.store = Store(folder=store, registry=registry, within=self.folder)
         self.store.tidy()
         self.background = BackgroundAdjustment()
         self._room = TOGETHER
@@ -207,8 +208,8 @@ class LiveMap:
         """Does the most urgent unit of work; None if there is none.
 
         Raises:
-            OutputError: the disk is full. No accepted photo is lost, and the same unit is repeated
-                when there is space.
+            OutputError: the disk is full, or the survey's folder gone. No accepted photo is lost,
+                and the same unit is repeated when there is space, or the folder is back.
         """
         began = time.perf_counter()
         if self._torn:
@@ -226,6 +227,7 @@ class LiveMap:
                 raise
             if system := of_the_system(error):
                 raise system from error
+            self.inbox.check()
             update = self._unexplained(error)
         if update is None:
             return None
@@ -249,7 +251,17 @@ class LiveMap:
         return Update(what="refused", photo=failed.number, text=text)
 
     def _refuse(self, failed: MemberFailedError) -> str:
-        """Stores that a photo is refused; returns its name and the reason."""
+        """Stores that a photo is refused; returns its name and the reason.
+
+        Raises:
+            OutputError: the folder of all photos is gone.
+        """
+        try:
+            self.inbox.check()
+        except OutputError:
+            self.background.stop()
+            self._torn = True
+            raise
         cause = failed.__cause__ if isinstance(failed.__cause__, Exception) else failed
         row = self.ledger.row("select name, source from photo where id = ?", failed.number)
         name, source = row if row is not None else (f"photo {failed.number}", "")

@@ -215,6 +215,7 @@ class Members:
             )
             if isinstance(photo, RejectedPhoto):
                 if state != "refused":
+                    self.inbox.check()
                     self.ledger.lost(int(number), str(name), str(source), photo.reason)
                 continue
             try:

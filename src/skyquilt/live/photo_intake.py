@@ -93,8 +93,8 @@ class Intake:
         """Accepts a file's bytes; when this returns `Accepted`, no crash can lose the photo.
 
         Raises:
-            OutputError: the disk is full; this photo was not accepted, and no accepted photo is
-            lost.
+            OutputError: the disk is full, or the survey's folder gone; this photo was not accepted,
+            and no accepted photo is lost.
         """
         name, source = shown_name(name), shown_name(source)
         if self._full():
@@ -154,6 +154,7 @@ class Intake:
             most_mp=self.settings.most_mp,
         )
         if isinstance(photo, RejectedPhoto):
+            self.inbox.check()
             gone(arrived.path)
             if photo.trace:
                 log_error(self.ledger.path.parent, f"{name}: {photo.reason}", photo.trace)

@@ -55,8 +55,11 @@ class Uploads:
     def begin(
         self, name: str, source: str, size: int, client: str = "", metadata: str = ""
     ) -> Upload | None:
-        """Creates an upload; None if this client has too many, or all clients together."""
-        self.folder.mkdir(parents=True, exist_ok=True)
+        """Creates an upload; None if this client has too many, or all clients together.
+
+        Raises OSError where it cannot be stored, as while the survey's folder is gone.
+        """
+        self.folder.mkdir(exist_ok=True)
         with self._lock:
             active = self._active()
             if len(active) >= self.guard.most_uploads or (
