@@ -10,7 +10,7 @@ import pytest
 from skyquilt.live.adjustment_schedule import QUIET_S, Blocks, Schedule
 from skyquilt.live.apply_adjustment import ApplyAdjustment
 from skyquilt.live.background_adjustment import BlockAdjustment
-from skyquilt.live.settings import CLOSING, GROWTH, PART, SWEEPING, YOUNG, LiveSettings
+from skyquilt.live.settings import CLOSING, GROWTH, PART, SWEEPING, WHOLE, YOUNG, LiveSettings
 from skyquilt.model.poses import Pose
 from skyquilt.settings import MosaicSettings
 from skyquilt.workflows.methods import methods_for
@@ -86,14 +86,41 @@ def test_blocks_of_which_no_photo_is_on_the_map_are_not_adjusted():
     assert blocks.due(0.0, idle=True) is None
 
 
-@pytest.mark.parametrize("size", [CLOSING, CLOSING + 1])
-def test_of_a_large_block_a_part_is_adjusted_around_its_newest_photo(size):
-    blocks = blocks_of(size, closed=(100,), since=PART)
+@pytest.mark.parametrize(
+    ("size", "closed", "in_part"),
+    [
+        (CLOSING, 100, False),
+        (CLOSING + 1, 100, False),
+        (CLOSING + 1, CLOSING, True),  # a loop is closed, and it has hardly grown
+        (WHOLE, CLOSING, False),
+        (WHOLE + 1, 100, True),
+    ],
+)
+def test_of_a_large_block_a_part_is_adjusted_around_its_newest_photo(size, closed, in_part):
+    loop = size if size == CLOSING + 1 else None
+    blocks = blocks_of(size, closed=(closed,), since=PART, loop=loop)
     ids, held = blocks.due(0.0, idle=False)
-    if size == CLOSING:
-        assert ids == list(range(1, size + 1)) and not held
+    moving = set(ids) - held
+    if in_part:
+        assert len(moving) == PART and size in moving and max(held) == size - PART
     else:
-        assert len(set(ids) - held) == PART and size in set(ids) - held and max(held) == size - PART
+        assert ids == list(range(1, size + 1)) and not held
+    whole_later = in_part and size <= WHOLE
+    assert blocks.schedule.closed_at == {1: closed if whole_later else size}
+
+
+def test_a_large_block_is_adjusted_as_a_whole_once_when_photos_pause():
+    blocks = blocks_of(CLOSING + 1, closed=(CLOSING,), since=0)
+    now = blocks.last_arrival
+    blocks._gaps.extend([5.0] * 9)  # photos that arrive every 5 s
+    blocks.last_arrival = now - QUIET_S - 1
+    assert blocks.due(0.0, idle=True) is None
+    blocks.last_arrival = now - 16.0
+    assert blocks.due(0.0, idle=True) == (list(range(1, CLOSING + 2)), frozenset())
+    assert blocks.due(0.0, idle=True) is None
+    large = blocks_of(WHOLE + 1, closed=(CLOSING,), since=0)
+    large.last_arrival = -1e9
+    assert large.due(0.0, idle=True) is None
 
 
 def test_a_loop_comes_first():

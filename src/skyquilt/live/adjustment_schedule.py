@@ -10,12 +10,16 @@ from typing import Any
 from skyquilt.live.background_adjustment import AdjustmentJob
 from skyquilt.live.ledger import Ledger
 from skyquilt.live.members import Members
-from skyquilt.live.settings import CLOSING, GROWTH, PART, SWEEPING, LiveSettings
+from skyquilt.live.settings import CLOSING, GROWTH, PART, SWEEPING, WHOLE, LiveSettings
 from skyquilt.model.camera import Camera
 from skyquilt.workflows.methods import Methods
 
 QUIET_S = 2.0
 """If no photo has arrived for this long, a block is adjusted even if it has grown little."""
+PAUSE, LONGEST_PAUSE_S = 3.0, 30.0
+"""A large block is, as a whole, if none has for so many times as long as is usual between photos,
+or for the second.
+"""
 KEY = "schedule"
 
 
@@ -74,11 +78,15 @@ class Schedule:
         if loop:
             self.loop = photo
 
-    def begun(self, block: int, size: int, *, sweep: bool) -> None:
-        """Notes that a job begins on a block of `size` photos."""
+    def begun(self, block: int, size: int, *, sweep: bool, part: bool = False) -> None:
+        """Notes that a job begins on a block of `size` photos; `part`: on a part of it, and it will
+        be adjusted as a whole later.
+        """
         before = {"closed_at": dict(self.closed_at), "swept_at": dict(self.swept_at)}
         self.under_way = {"since": self.since, "loop": self.loop, **before}
-        self.closed_at[block], self.since, self.loop = size, 0, None
+        self.since, self.loop = 0, None
+        if not part:
+            self.closed_at[block] = size
         if sweep:
             self.swept_at[block] = size
 
@@ -107,34 +115,50 @@ class Blocks:
         self.members, self.schedule, self.settings = members, schedule, settings
         self.folder, self.store, self.methods = folder, store, parts
         self.last_arrival = time.monotonic()
+        self._gaps: deque[float] = deque(maxlen=15)
+
+    def arrived(self) -> None:
+        """Notes that a photo arrives."""
+        now = time.monotonic()
+        self._gaps.append(now - self.last_arrival)
+        self.last_arrival = now
 
     @property
     def quiet(self) -> bool:
         """Whether no photo has arrived for a while."""
         return time.monotonic() - self.last_arrival > QUIET_S
 
+    @property
+    def paused(self) -> bool:
+        """Whether none has for long, as photos arrive."""
+        usual = sorted(self._gaps)[len(self._gaps) // 2] if self._gaps else 0.0
+        pause = min(max(QUIET_S, PAUSE * usual), LONGEST_PAUSE_S)
+        return time.monotonic() - self.last_arrival > pause
+
     def due(self, ground: float, *, idle: bool) -> AdjustmentJob | None:
         """The block, or part of a block, that should be adjusted as a whole now; None where none is
         due. `ground`: height of the ground in m.
         """
-        quiet = idle and self.quiet
+        quiet, paused = idle and self.quiet, idle and self.paused
         if not self.settings.reposition or not (quiet or self.schedule.since):
             return None
-        root = self._root() if self.schedule.since else self._unfinished()
+        root = self._root() if self.schedule.since else self._unfinished(paused)
         block = self.members.block(root) if root in self.members.by_id else set[int]()
         name = self.members.block_of.get(root, root)
         grown = len(block) >= GROWTH * self.schedule.closed_at.get(name, 2)
         if len(block) < 3 or not (grown or self.schedule.loop is not None or quiet):
             return None
         ids, held = sorted(block), frozenset[int]()
-        if len(block) > CLOSING:
+        large = len(block) > WHOLE or (len(block) > CLOSING and not (grown or paused))
+        if large:
             if not idle and self.schedule.loop is None and self.schedule.since < PART // 4:
                 return None
             ids, held = self._around(root)
         sweep = quiet and not held and len(ids) <= SWEEPING
         job = self._job(ids, held, ground, sweep=sweep)
         if job is not None:
-            self.schedule.begun(name, len(block), sweep=sweep)
+            part = large and len(block) <= WHOLE
+            self.schedule.begun(name, len(block), sweep=sweep, part=part)
         return job
 
     def _root(self) -> int:
@@ -162,16 +186,17 @@ class Blocks:
             if any(known[i].pose is not None for i in block)
         ]
 
-    def _unfinished(self) -> int:
+    def _unfinished(self, paused: bool) -> int:
         """The newest photo of a block that was not adjusted as it is now, or not with ground
-        heights by plane sweep; 0 where there is none. Larger blocks are adjusted in parts as they
-        grow.
+        heights by plane sweep; 0 where there is none. Large blocks only count where photos pause;
+        those beyond are adjusted in parts as they grow.
         """
+        most = WHOLE if paused else CLOSING
         closed, swept = self.schedule.closed_at, self.schedule.swept_at
         for name, block in self._on_map():
             size = len(block)
             last = swept if size <= SWEEPING else closed
-            if 3 <= size <= CLOSING and last.get(name) != size:
+            if 3 <= size <= most and last.get(name) != size:
                 return max(block)
         return 0
 

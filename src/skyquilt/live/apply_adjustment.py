@@ -106,9 +106,11 @@ class ApplyAdjustment:
         return Update(what="noted", text=f"a block could not be adjusted as a whole: {problem}")
 
     def _since(self, done: BlockAdjustment) -> list[Member]:
-        """Photos that have joined the block since the job began; empty for large blocks."""
+        """Photos that have joined the block since the job began; none where that was one on a part
+        of a large block.
+        """
         block = self.members.block(next(iter(done.poses)))
-        if len(block) > CLOSING:
+        if len(block) > CLOSING and not done.cameras:
             return []
         return [self.members.by_id[i] for i in sorted(block - set(done.ids))]
 

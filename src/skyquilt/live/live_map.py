@@ -322,7 +322,7 @@ class LiveMap:
         if not self.queues.received:
             return None
         self._room = max(0, self._room - 1)
-        self.blocks.last_arrival = time.monotonic()
+        self.blocks.arrived()
         first = self.queues.received[0]
         if first.id % TIDY == 0:
             give_back()

@@ -16,7 +16,7 @@ from skyquilt.live.links import link_bytes
 from skyquilt.live.local_pose import Change, LocalPose
 from skyquilt.live.members import Member, Queues, about_record
 from skyquilt.live.redraw_queue import RedrawQueue
-from skyquilt.live.settings import CLOSING
+from skyquilt.live.settings import WHOLE
 from skyquilt.live.thermal_notes import ThermalNotes
 from skyquilt.live.veils import LiveVeils
 from skyquilt.model.features import Link
@@ -341,7 +341,7 @@ class Refinement:
             aside = member.state == "refined" and member.prior.sigma_tilt_deg > STATED_DEG
             if not aside or member.pose is None or tilt_deg(member.pose.cam_R_map) < ASIDE_DEG:
                 continue
-            if len(self.members.block(member.id)) <= CLOSING:
+            if len(self.members.block(member.id)) <= WHOLE:
                 for i in self.local_pose.neighbours.beside(member):
                     yield member, i
 

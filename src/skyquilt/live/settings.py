@@ -12,9 +12,10 @@ NEIGHBOURS = 8
 """Largest number of placed photos with which a new one is compared."""
 YOUNG = 10
 """Blocks of at most this number of photos are adjusted as a whole with every photo that joins."""
-CLOSING = 150
-"""Blocks of at most this number of photos are adjusted as a whole in the background; of larger
-blocks only a part is adjusted.
+CLOSING, WHOLE = 150, 500
+"""Blocks of at most the first number of photos are adjusted as a whole in the background. Those of
+at most the second are when they have grown or photos pause, and otherwise in part, as larger ones
+always are.
 """
 PART = 120
 """Number of photos that may move in such a part."""
