@@ -94,7 +94,7 @@ IN_NO_KEY = {
 """Constants of the stages that no method's key holds, and why that is right."""
 BY_VALUE = {
     f"skyquilt.ortho.{name}": "what photos show badly is in the key of the seams, by value"
-    for name in ("sharpness", "spoilt", "veiled")
+    for name in ("sharpness", "spoilt", "lasting_marks", "veiled")
 } | {"skyquilt.ortho.palettes": "what is told of palettes is told anew by every run"}
 """Modules whose constants no method's key holds, and why that is right."""
 

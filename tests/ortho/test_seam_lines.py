@@ -7,7 +7,7 @@ import pytest
 
 from skyquilt.engine.kept import Keep
 from skyquilt.engine.workers import Threads
-from skyquilt.imaging.blank import marked
+from skyquilt.imaging.blank import around, marked
 from skyquilt.imaging.nodes import densify, project_nodes
 from skyquilt.imaging.view_limits import ViewLimits
 from skyquilt.model.raster import Grid, Window
@@ -93,6 +93,28 @@ def test_marks_are_shown_only_where_no_other_photo_shows_the_ground(scene):
     before, after, one = share(views), share(withs), share(withs[:1])
     assert max(before) > 0.9 and one[0] == 1
     assert max(after) <= 0.02
+
+
+def test_a_thin_cross_does_not_slip_between_the_middles_of_cells(scene):
+    """Lines of 1 px in the middle of every photo, over cells of some 7 px: no cell shows them that
+    another photo shows as well.
+    """
+    views, pictures = scene
+    shown = np.zeros((300, 400), bool)
+    shown[135:166, 200] = shown[150, 185:216] = True
+    mark = around(shown, (400, 300))
+    withs = [replace(v, limits=ViewLimits(mark=mark)) for v in views]
+    labels = SeamLines()(withs, FLAT, GRID, lambda photo, side: pictures[photo], NEUTRAL)
+    row, column = np.mgrid[: GRID.height, : GRID.width]
+    x, y = GRID.x(column), GRID.y(row)
+    side = round(labels.cells.gsd / GRID.gsd)
+    for v in views:
+        nodes = project_nodes(v, x, y, np.zeros_like(x))
+        u, w = (np.rint(np.clip(p, 0, size - 1)).astype(int) for p, size in
+                ((nodes.u, 400), (nodes.v, 300)))  # fmt: skip
+        on = nodes.seen & shown[w, u]
+        assert on.any()
+        assert not (labels.photo[row[on] // side, column[on] // side] == v.photo).any()
 
 
 def test_tiles_continue_their_neighbours(scene, monkeypatch):

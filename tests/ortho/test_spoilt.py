@@ -11,6 +11,7 @@ from PIL import Image
 
 from skyquilt.imaging.blank import around, joined
 from skyquilt.imaging.views import make_views, native_gsd
+from skyquilt.ortho.lasting_marks import _hardly_varying, _is_mark
 from skyquilt.ortho.spoilt import coarser_parts, spoilt_parts
 from skyquilt.ortho.tie_surface import level
 from skyquilt.settings import MosaicSettings
@@ -137,6 +138,50 @@ def test_dust_yields_where_all_photos_show_it():
     assert not yields[np.min([d - 3 * r for d, r, _ in away], axis=0) > 20].any()
     assert len(notes) == 1 and "darkened at the same place of every picture" in notes[0]
     assert shown(alignment, clean) == ({}, ())
+
+
+def written(picture):
+    """A picture with a cross of thin lines and the even scale of a palette."""
+    picture = picture.copy()
+    picture[149:151, 188:213] = picture[138:163, 199:201] = 255
+    picture[70:230, 380:390] = np.linspace(250, 5, 160)[:, None, None]
+    return picture
+
+
+def test_a_cross_and_a_scale_yield_though_they_have_few_features():
+    alignment = flight(12, apart=6.0)
+    clean = pictures(alignment)
+    marks, notes = shown(alignment, {i: written(p) for i, p in clean.items()})
+    assert sorted(marks) == list(range(12))
+    v, u = np.mgrid[:300, :400]
+    changed = (written(np.full((300, 400, 3), 1, np.uint8)) != 1).any(2)
+    yields = marks[3].at(u, v) < 0
+    assert yields[changed].all()
+    assert (yields & ~changed).mean() < 0.015  # a margin of a few px
+    assert len(notes) == 1 and "on 1.4 % of it" in notes[0] and "a cross, a scale" in notes[0]
+
+
+def test_a_road_that_the_drone_follows_is_no_mark():
+    """It hardly varies while the fields beside it do, but other photos show it, too."""
+    ground = GROUND.copy()
+    ground[1560:1640] = 230
+    alignment = flight(12, apart=6.0)
+    views = make_views(alignment, level(0.0))[:10]
+    seen = pictures(alignment, ground)
+    grey = np.stack([seen[v.photo][..., 0] for v in views])
+    label = _hardly_varying(grey)
+    assert label.max() > 0
+    parts = range(1, label.max() + 1)
+    assert not any(_is_mark(label, k, views, grey, level(0.0)) for k in parts)
+    assert shown(alignment, seen) == ({}, ())
+
+
+def test_white_is_warm_in_thermal_photos_and_tells_no_overexposure():
+    alignment, thumbnails = flight(12), plain(12)
+    thumbnails[4][50:100, 20:120, 0] = 252
+    details, names = seen(alignment), [f"{k}.jpg" for k in range(12)]
+    of_heat = spoilt_parts(alignment, lambda k: details[k], thumbnails, names, {}, None, range(12))
+    assert of_heat == ({}, ())
 
 
 def test_what_a_hover_shows_at_one_place_is_no_dust():

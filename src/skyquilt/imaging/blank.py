@@ -53,6 +53,11 @@ class Blank:
         below = self.room[i + 1, j] * (1 - x) + self.room[i + 1, j + 1] * x
         return np.asarray(above * (1 - y) + below * y, np.float32)
 
+    def near(self, u: NDArray[Any], v: NDArray[Any], px: float) -> Mask:
+        """Whether photo columns and rows of any shape lie within it, or less than `px` beside."""
+        side = self.size[0] / self.room.shape[1]
+        return np.asarray(self.at(u, v) < min(px / side / REACH, 1.0))
+
 
 def find_blanks(
     cameras: Mapping[int, tuple[str, tuple[int, int]]],

@@ -122,7 +122,9 @@ class LiveVeils:
         views = [
             v
             for m in alike
-            if thumbnails[m.id].dtype == np.uint8 and (v := self._view(m, ground)) is not None
+            if thumbnails[m.id].dtype == np.uint8
+            and m.photo.band == "visible"
+            and (v := self._view(m, ground)) is not None
         ]
         if len(views) < FEWEST_VIEWS:
             return {}

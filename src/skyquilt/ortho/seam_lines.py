@@ -320,7 +320,8 @@ class _Scene:
             if smear.any():  # what lies flat yields to sharper photos
                 own[densify(smear.astype(np.float32), *size, 2) > 0.5] += SMEARED
             if (mark := view.limits.mark) is not None:  # so does what was written over the ground
-                own[densify(mark.at(n.u[near], n.v[near]), *size, 2) < 0] += SMEARED
+                u, v = (densify(px[near], *size, 2) for px in (n.u, n.v))
+                own[mark.near(u, v, _half_cell_px(n.u[near], n.v[near]))] += SMEARED
             shadow = self._shadows(view.photo)
             if not shadow.empty:
                 x, y, z = fx[at], fy[at], over[at]
@@ -394,3 +395,11 @@ def _extent(cells: Mask) -> tuple[Part, Part]:
         inner.append(slice(2 * first, min(2 * last, size)))
         outer.append(slice(first, last + 2))
     return (inner[0], inner[1]), (outer[0], outer[1])
+
+
+def _half_cell_px(u: Float, v: Float) -> float:
+    """Half the diagonal of a cell in px of a photo, from its columns and rows (h, w) of nodes two
+    cells apart: a mark that is thinner must not slip between the middles of cells.
+    """
+    across = np.hypot(np.diff(u, axis=1), np.diff(v, axis=1))
+    return float(np.median(across) / np.sqrt(8))

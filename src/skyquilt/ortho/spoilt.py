@@ -5,7 +5,7 @@ Dust on a lens or a sensor darkens the same place of every picture. What a photo
 darker than what others show of the same ground, and than what lies beside it in the picture.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import cv2
@@ -18,6 +18,7 @@ from skyquilt.imaging.views import make_views, native_gsd, on_ground
 from skyquilt.model.poses import Alignment
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.exposure import Balance, Samples
+from skyquilt.ortho.lasting_marks import find_lasting_marks
 from skyquilt.ortho.radiometry import InGrey
 from skyquilt.ortho.sharpness import FEWEST_SPOILT, LARGEST_SPOT, find_blurred
 from skyquilt.ortho.tie_surface import level
@@ -70,10 +71,13 @@ def spoilt_parts(
     names: Sequence[str],
     fixed: Mapping[int, Blank],
     gsd_cm: float | None = None,
+    heat: Collection[int] = (),
 ) -> tuple[dict[int, Blank], tuple[str, ...]]:
     """What yields to other photos, by photo (index), only of photos where something does, and
     notes. `details` as in `find_blurred`, `thumbnails` (h, w[, bands]), `names` of the photos,
     `fixed`: where they show marks, `gsd_cm`: ground size of a map pixel, None: that of the photos.
+    `heat`: thermal photos, in which white is warm, and contrast that of a palette: neither tells
+    overexposure, smoke or fog.
     """
     blurred, notes = find_blurred(alignment, details, names)
     white, of_8_bits = dict[int, Blank](), set[int]()
@@ -81,7 +85,7 @@ def spoilt_parts(
         camera, thumbnail = alignment.camera(i), thumbnails[i]
         if thumbnail.dtype == np.uint8:
             of_8_bits.add(i)
-        if part := overexposed(thumbnail, (camera.width, camera.height)):
+        if i not in heat and (part := overexposed(thumbnail, (camera.width, camera.height))):
             white[i] = part
     if white:
         notes += (overexposed_note([names[i] for i in white]),)
@@ -89,18 +93,25 @@ def spoilt_parts(
     flat = level(alignment.ground_m)
     placed = make_views(alignment, flat)
     views = [v for v in placed if v.photo in of_8_bits]
-    spots, told = find_spots(alignment, views, flat, thumbnails)
+    apart = _apart(alignment, views, flat)
+    cameras = [alignment.camera_of[v.photo] for v in apart]
+    written, told = find_lasting_marks(apart, cameras, thumbnails, flat, fixed)
+    marks = {v.photo: written[c] for v in views if (c := alignment.camera_of[v.photo]) in written}
+    notes += told
+    marked = {**fixed, **marks}
+    spots, told = find_spots(alignment, views, apart, flat, thumbnails, marked)
     notes += told
     # what is overexposed or blurred has little contrast as well, and was told; a drop is not all
     pale = white.keys() | {i for i, part in blurred.items() if (part.room < 0).all()}
-    veiled = veiled_parts(views, xyz, thumbnails, fixed, spoilt=pale) if len(xyz) else {}
+    of_light = [v for v in views if v.photo not in heat]
+    veiled = veiled_parts(of_light, xyz, thumbnails, fixed, spoilt=pale) if len(xyz) else {}
     if unnamed := sorted(veiled.keys() - pale):
         notes += (veiled_note([names[i] for i in unnamed]),)
     gsd = gsd_cm / 100 if gsd_cm else native_gsd(placed, flat) if placed else 0.0
     coarse, told = coarser_parts(alignment, placed, names, gsd)
     notes += told
     out = dict(fixed)
-    for found in (blurred, white, spots, veiled, coarse):
+    for found in (marks, blurred, white, spots, veiled, coarse):
         out |= {i: joined(out[i], b) if i in out else b for i, b in found.items()}
     return out, notes
 
@@ -214,13 +225,15 @@ def overexposed(thumbnail: NDArray[Any], size: tuple[int, int]) -> Blank | None:
 def find_spots(
     alignment: Alignment,
     views: Sequence[View],
+    apart: Sequence[View],
     flat: Surface,
     thumbnails: Mapping[int, NDArray[Any]],
+    marked: Mapping[int, Blank],
 ) -> tuple[dict[int, Blank], tuple[str, ...]]:
     """Dark spots at the same place of all pictures of a camera, by photo (index), and notes.
-    `views` of level ground, `flat`; `thumbnails`: (h, w[, bands]) of their photos, of 8 bits.
+    `views` of level ground, `flat`, and those from places `apart`; `thumbnails`: (h, w[, bands]) of
+    their photos, of 8 bits; `marked`: where they show marks, which are no ground, by index.
     """
-    apart = _apart(alignment, views, flat)
     if len(apart) < FEWEST_SPOILT:
         return {}, ()
     outline = np.concatenate([v.footprint for v in apart])
@@ -237,6 +250,9 @@ def find_spots(
             continue
         size = alignment.cameras[name].width, alignment.cameras[name].height
         here = own[samples.row] & np.isfinite(darker)
+        if (mark := marked.get(apart[int(np.argmax(own))].photo)) is not None:
+            v, u = (_shares(samples.place, size) * size[::-1] - 0.5).T
+            here &= mark.at(u, v) >= 0
         if not here.any():  # no ground is shown by three photos
             continue
         spot = _spots(samples.place[here], darker[here], size)
@@ -300,8 +316,7 @@ def _spots(
     off = off - _quartiles(ring, off, RINGS)[1, ring]
     cell = max(size) / SPOT_CELLS
     shape = tuple(max(1, round(n / cell)) for n in size[::-1])
-    share = place[:, ::-1] * np.hypot(*size) / 2 / np.array(size[::-1]) + 0.5
-    row, column = np.clip((share * shape).astype(int), 0, np.array(shape) - 1).T
+    row, column = np.clip((_shares(place, size) * shape).astype(int), 0, np.array(shape) - 1).T
     at = row * shape[1] + column
     count = np.bincount(at, minlength=shape[0] * shape[1]).reshape(shape)
     low, middle, high = _quartiles(at, off, count.size).reshape(3, *shape)
@@ -318,6 +333,13 @@ def _spots(
     together = cv2.filter2D(dark.view(np.uint8), -1, square, borderType=cv2.BORDER_CONSTANT)
     spot = cv2.dilate((dark & (together > 1)).view(np.uint8), square) > 0
     return spot if spot.mean() <= LARGEST_SPOT else np.zeros_like(spot)
+
+
+def _shares(place: NDArray[Any], size: tuple[int, int]) -> NDArray[np.float64]:
+    """Rows and columns (n, 2), in shares of its sides, of places (n, 2) in a picture of a `size`
+    (width and height in px), see `image_place`.
+    """
+    return np.asarray(place[:, ::-1] * np.hypot(*size) / 2 / np.array(size[::-1]) + 0.5)
 
 
 def _quartiles(group: NDArray[Any], value: NDArray[np.float64], number: int) -> NDArray[np.float64]:

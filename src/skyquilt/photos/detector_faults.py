@@ -44,7 +44,10 @@ class FindFaults:
     stuck: float = 0.1
     """Share of its neighbours' changes from frame to frame below which a pixel is stuck."""
     lasting: float = 0.9
-    """Share of frames in which it must differ to the same side."""
+    """Share of frames in which a stuck pixel must keep its value, and another bad one must differ
+    to the same side, by a third of `outlying` at least: of few frames, half may be alike, or nearly
+    all differ to one side, by chance.
+    """
     apart: float = 0.75
     """Share of frames in which a stuck pixel differs from its neighbours by so much."""
     rounds: int = 3
@@ -65,7 +68,7 @@ class FindFaults:
     """Correlation of neighbouring columns from which they show ground: the lens blurs it over more
     than one pixel, while each column of a detector has an error of its own.
     """
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     def __call__(self, frames: Sequence[Values]) -> DetectorFaults | None:
         """The faults of one camera; None where there are none or frames do not tell.
@@ -126,7 +129,9 @@ class FindFaults:
         # a stuck pixel keeps its value whatever its neighbours do, and seldom has theirs: those of
         # a saturated picture keep theirs, too
         apart = (np.abs(off) > self.stuck * around).mean(0) >= self.apart
-        stuck = (_spread(whole) < self.stuck * around) & apart
+        moved = np.abs(whole - np.median(whole, 0))
+        still = np.quantile(moved, self.lasting, axis=0, method="lower") < self.stuck * around
+        stuck = still & apart
         # bad ones beside it may have made a good one an outlier: good ones alone are to say so
         mended = np.stack([filled(f, bad | stuck | outlying) for f in whole])
         alone = self._outlying(np.where(np.isnan(mended), off, whole - mended), scales)
@@ -138,8 +143,10 @@ class FindFaults:
         """
         half = len(off) // 2
         first, second = np.median(off[:half], 0), np.median(off[half:], 0)
-        far = [np.abs(o) > self.outlying * s for o, s in zip((first, second), scales, strict=True)]
-        same = np.maximum((off > 0).mean(0), (off < 0).mean(0)) >= self.lasting
+        least = [self.outlying * s for s in scales]
+        far = [np.abs(o) > x for o, x in zip((first, second), least, strict=True)]
+        some = np.where(np.arange(len(off)) < half, *least)[:, None, None] / 3
+        same = np.maximum((off > some).mean(0), (off < -some).mean(0)) >= self.lasting
         return np.asarray((first * second > 0) & far[0] & far[1] & same)
 
     def _lines(self, frames: Sequence[Values]) -> NDArray[np.float32]:
