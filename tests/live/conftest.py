@@ -143,7 +143,7 @@ class Served:
                 return False
             # a quiet moment begins an adjustment of each block that was not adjusted as it is now
             quiet_s = time.monotonic() - live.blocks.last_arrival
-            left = live.blocks._unfinished() or (schedule.since and quiet_s < QUIET_S + 1)
+            left = live.blocks._unfinished(True) or (schedule.since and quiet_s < QUIET_S + 1)
             if live.settings.reposition and left:
                 return False
             before = self.web.get("/photos").json()
