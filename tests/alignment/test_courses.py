@@ -125,7 +125,9 @@ def test_photos_that_share_next_to_nothing_are_placed_along_the_line_of_flight(h
         np.testing.assert_allclose(pose.cam_R_map, cam_R_map_from_angles(yaw[i]), atol=0.05)
     assert "where it goes" in found.notes[-1]
     held = replace(one, poses=dict(list(done.poses.items())[:4]), blocks=((0, 1, 2, 3),))
-    assert by_pose(height_m, repair=True).instead_of(held, inputs) is held
+    nothing = replace(one, poses={}, blocks=())  # they were taken from one place
+    for other in (held, nothing):
+        assert by_pose(height_m, repair=True).instead_of(other, inputs) is other
 
 
 def test_headings_of_a_few_links_turn_no_other_photos():

@@ -131,9 +131,13 @@ class ByReport:
 
     def instead_of(self, few: Alignment, inputs: AlignmentInputs) -> Alignment:
         """All photos placed by metadata where an adjustment held next to none and that is twice as
-        many; otherwise what the adjustment found.
+        many; otherwise what the adjustment found. Where that is nothing, photos were taken from one
+        place, which is another matter.
         """
-        if len(few.held) >= FEWEST_HEADED or 2 * len(few.poses) >= len(inputs.photos):
+        told = sum(bool(np.isfinite(p.map_C[:2]).all()) for p in inputs.priors)
+        by_control = any(not point.check for point in inputs.control)
+        enough = len(few.held) >= FEWEST_HEADED or 2 * len(few.poses) >= told
+        if enough or by_control or not few.poses:
             return few
         try:
             found = self(inputs)
