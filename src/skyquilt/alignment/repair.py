@@ -72,14 +72,14 @@ def _headed(found: Repaired, photos: Sequence[Photo]) -> Repaired:
     course = np.full(len(yaw), np.nan)
     course[known] = headings_by_course(own, at[known], yaw[known], assumed=True)
     flown = np.isfinite(course)
+    if not flown.any():
+        return found
     priors = tuple(
         replace(p, yaw_deg=float(c), sigma_yaw_deg=SIGMA_COURSE_DEG, yaw_source="flight")
         if headed
         else p
         for p, c, headed in zip(found.priors, course, flown, strict=True)
     )
-    if not flown.any():
-        return found
     guessed = not np.isfinite(yaw[known]).any()
     how = "their tops are taken to show where it goes" if guessed else "as the others are headed"
     names = sentence_of([photos[i].name for i in np.flatnonzero(flown).tolist()])

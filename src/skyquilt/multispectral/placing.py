@@ -16,7 +16,7 @@ from skyquilt.engine.clock import Steps
 from skyquilt.engine.workers import Workers
 from skyquilt.model.camera import Camera
 from skyquilt.model.event import Note
-from skyquilt.model.photo import Photo, RejectedPhoto, evenly
+from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.registration import RefusedRegistration
 from skyquilt.multispectral.captures import (
     THERMAL,
@@ -32,7 +32,7 @@ from skyquilt.multispectral.recorded import Recorded, look_at
 from skyquilt.multispectral.reflectance import KINDS, Kind, common_kind
 from skyquilt.photos.left_out import without_partner
 from skyquilt.workflows.flow import AlignedPhotos, Scene
-from skyquilt.workflows.second_camera import far, together_of
+from skyquilt.workflows.second_camera import far, seen_together
 
 Velocity = NDArray[np.float64]
 """(3,) in m/s in the map frame."""
@@ -178,12 +178,7 @@ def _rig(
             reason="the map's photos have no adjusted poses; use --method bundle"
         )
     pairs = far(scene, pairs)
-    asked = [pairs[k] for k in evenly(len(pairs), MOST_PAIRS)]
-    seen = [
-        t
-        for i, j in asked
-        if (t := together_of(scene, i, band.photos[j], velocities[i])) is not None
-    ]
+    seen = seen_together(scene, pairs, band.photos, velocities, MOST_PAIRS)
     if not pairs:
         return FindBandRig()(seen, Camera.ideal(width=1, height=1, focal=1.0), 0.0)
     (i, j), *_ = pairs

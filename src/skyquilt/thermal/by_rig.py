@@ -39,7 +39,7 @@ from skyquilt.raster import CogWriter, RasterSpec
 from skyquilt.settings import PictureSettings
 from skyquilt.workflows.flow import Scene
 from skyquilt.workflows.photo_features import THUMBNAIL, pixels_again
-from skyquilt.workflows.second_camera import far, pose_beside, together_of
+from skyquilt.workflows.second_camera import far, pose_beside, seen_together
 
 MOST_PAIRS = 12
 """Largest number of pairs registered, distributed over the flight; each takes one or two
@@ -146,9 +146,7 @@ def _with_lens(
     nothing. A strong lens keeps these from being registered by a homography.
     """
     first, near = thermal[pairs[0][1]], None
-    pairs = far(scene, pairs)
-    asked = [pairs[k] for k in evenly(len(pairs), MOST_PAIRS)]
-    seen = [t for i, j in asked if (t := together_of(scene, i, thermal[j], velocity[i]))]
+    seen = seen_together(scene, far(scene, pairs), thermal, velocity, MOST_PAIRS)
     if isinstance(rig, Rig):
         turn = np.asarray(Rotation.from_matrix(rig.b_R_a).as_rotvec())
         near = Beside(turn=turn, place=rig.a_t_b[:2], camera=rig.camera_b, delay_s=rig.delay_s)

@@ -2,7 +2,7 @@
 map knows of the ground and of the flight.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from skyquilt.coregistration.rig import Rig
 from skyquilt.imaging.grey import shrink, to_grey8
 from skyquilt.imaging.nodes import View
 from skyquilt.imaging.views import on_ground
-from skyquilt.model.photo import Photo
+from skyquilt.model.photo import Photo, evenly
 from skyquilt.model.poses import Pose
 from skyquilt.photos.pixels import read_color
 from skyquilt.workflows.flow import Scene
@@ -46,7 +46,23 @@ def pose_beside(pose: Pose, rig: Rig | BandRig, velocity: NDArray[np.float64]) -
     return Pose(cam_R_map=rig.b_R_a @ pose.cam_R_map, map_C=pose.map_C + moved)
 
 
-def together_of(
+def seen_together(
+    scene: Scene,
+    pairs: Sequence[tuple[int, int]],
+    photos: Sequence[Photo],
+    velocities: Mapping[int, NDArray[np.float64]],
+    most: int,
+) -> list[Together]:
+    """Pictures of at most so many pairs, spread evenly over the flight, without those whose file
+    cannot be read. A pair: indices of the map's photo and of one of `photos`; `velocities` (3,) of
+    the former, m/s in the map frame.
+    """
+    asked = [pairs[k] for k in evenly(len(pairs), most)]
+    found = (_together(scene, i, photos[j], velocities[i]) for i, j in asked)
+    return [pictures for pictures in found if pictures is not None]
+
+
+def _together(
     scene: Scene, index: int, other: Photo, velocity: NDArray[np.float64]
 ) -> Together | None:
     """Pictures of one capture; None where its file cannot be read."""
