@@ -40,6 +40,7 @@ from skyquilt.model.poses import Alignment, no_ties
 from skyquilt.ortho import orthomosaic
 from skyquilt.ortho.exposure import NEUTRAL, Exposure
 from skyquilt.ortho.ground import Ground, round_gsd
+from skyquilt.ortho.occlusion import gentle
 from skyquilt.photos.pixels import read_color
 from skyquilt.quality.seam_measurement import measure_seams
 from skyquilt.quality.tone import tone_residual
@@ -213,6 +214,7 @@ def mapped(survey: Path, gsd: float) -> Iterator[tuple[LiveMap, Alignment, Groun
     )
     rough = make_views(alignment, live.canvas.surface((-1, -1, 1, 1)))
     surface = live.canvas.surface(grid_of(rough, 1.0).bounds)
+    surface = gentle(surface, np.array([p.map_C for p in alignment.poses.values()]))
     views = make_views(alignment, surface)
     native = native_gsd(views, surface)
     grid = grid_of(views, round_gsd(native))

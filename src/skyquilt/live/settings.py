@@ -20,7 +20,7 @@ always are.
 PART = 120
 """Number of photos that may move in such a part."""
 SWEEPING = 60
-"""For blocks of at most this number of photos, ground heights are computed by plane sweep when no
+"""For blocks of at most this number of photos, ground heights are computed as in `mosaic` when no
 photos arrive.
 """
 GROWTH = 1.3

@@ -34,6 +34,7 @@ from skyquilt.ortho.blend import Blend, Feather, First, Float, Layer, Order
 from skyquilt.ortho.compose import Composed, Composer
 from skyquilt.ortho.exposure import Exposure
 from skyquilt.ortho.height_cells import HeightCells
+from skyquilt.ortho.occlusion import gentle
 from skyquilt.ortho.plan import Plan
 from skyquilt.ortho.spoilt import overexposed
 from skyquilt.raster.tile_store import SIDE, Address, Tile, TileStore, covering
@@ -74,6 +75,8 @@ COUNTS, COLOURS = "thermal-counts", "thermal-colours"
 """Layers of thermal photos whose values are of no known unit, and of those that hold the colours of
 a palette; `thermal` has degrees Celsius.
 """
+RIM = 12
+"""Cells around a tile whose heights are looked at, too, so that neighbouring tiles agree."""
 MOST_VIEWS = 24
 """Largest number of photos from which a tile is composed."""
 LEAST_MOVE = 0.6
@@ -388,8 +391,9 @@ class Canvas:
         if not inside:
             return None
         west, south, east, north = grid.bounds
-        rim = 8 * self.heights.cell
+        rim = RIM * self.heights.cell
         surface = self.surface((west - rim, south - rim, east + rim, north + rim))
+        surface = gentle(surface, np.array([v.pose.map_C for v in inside]))
         values = measured(self.members[inside[0].photo])
         return Composer(
             grid=grid,

@@ -1,13 +1,16 @@
 """What each photo cannot see: places behind trees and roofs, from the height surface."""
 
+from dataclasses import replace
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.geometry.neighbours import nearest
 from skyquilt.imaging.nodes import View
 from skyquilt.model.raster import Grid
+from skyquilt.model.surface import Surface
 
 Float = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -15,6 +18,38 @@ STANDING_M = 1.0
 """Height in m over the bare ground from which something hides what is behind it."""
 LEAST_M = 0.6
 """Heights in m by which a line of sight must pass below a surface to be blocked."""
+
+MOST_STRETCHED = 2.0
+"""How many times as long as on level ground a photo's pixel may lie on ground that falls away."""
+ENOUGH_M = 0.01
+"""Change in m of heights below which they are gentle enough."""
+
+
+def gentle(surface: Surface, centres: NDArray[np.float64]) -> Surface:
+    """Heights that fall away from the nearest of these photos' centres (n, 3) in m so gently that
+    it sees all of them: nothing is hidden behind trees and roofs, where its pixels would be smeared
+    over what it does not see. Their far sides are lowered and so shown leaning outwards, as on a
+    map of bare ground; the ground beside them stays where it is.
+    """
+    z, cell = surface.z, surface.cell
+    rows, columns = (m.astype(np.float32) for m in np.mgrid[: z.shape[0], : z.shape[1]])
+    x, y = surface.x0 + columns * cell, surface.y0 + rows * cell
+    place = np.stack([x.ravel(), y.ravel()], 1)
+    mine = centres[nearest(centres[:, :2], place, 1)[1][:, 0]].reshape(*z.shape, 3)
+    aside, along = x - mine[..., 0], y - mine[..., 1]
+    distance = np.maximum(np.hypot(aside, along), cell)
+    outer_column = (columns + aside / distance).astype(np.float32)
+    outer_row = (rows + along / distance).astype(np.float32)
+    sight = np.maximum(mine[..., 2] - z, 0) / distance  # fall of the line of sight, m per m
+    fall = ((1 - 1 / MOST_STRETCHED) * sight * cell).astype(np.float32)
+    for _ in range(max(z.shape)):
+        outer = cv2.remap(
+            z, outer_column, outer_row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        before, z = z, np.minimum(z, outer + fall)
+        if float((before - z).max()) < ENOUGH_M:
+            break
+    return replace(surface, z=z)
 
 
 class Shadow:
