@@ -32,7 +32,7 @@ class Schedule:
     closed_at: dict[int, int] = field(default_factory=dict)
     """Number of photos that each block had when it was last adjusted as a whole, by block name."""
     swept_at: dict[int, int] = field(default_factory=dict)
-    """The same of the last time when ground heights were computed by plane sweep as well."""
+    """The same of the last time when ground heights were computed as in `mosaic` as well."""
     since: int = 0
     """Number of photos refined since a block was last adjusted."""
     loop: int | None = None
@@ -188,7 +188,7 @@ class Blocks:
 
     def _unfinished(self, paused: bool) -> int:
         """The newest photo of a block that was not adjusted as it is now, or not with ground
-        heights by plane sweep; 0 where there is none. Large blocks only count where photos pause;
+        heights as in `mosaic`; 0 where there is none. Large blocks only count where photos pause;
         those beyond are adjusted in parts as they grow.
         """
         most = WHOLE if paused else CLOSING

@@ -71,9 +71,7 @@ class AdjustmentJob:
     methods: Methods
     """The methods with which features were found."""
     sweep: bool
-    """Whether ground heights are also computed from the images by plane sweep, as in the batch
-    workflow.
-    """
+    """Whether ground heights are also computed from the images, as in the batch workflow."""
     most_view_deg: float = 90.0
     """Angle from the nadir up to which photos are drawn."""
 

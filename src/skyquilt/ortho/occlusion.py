@@ -18,7 +18,6 @@ STANDING_M = 1.0
 """Height in m over the bare ground from which something hides what is behind it."""
 LEAST_M = 0.6
 """Heights in m by which a line of sight must pass below a surface to be blocked."""
-
 MOST_STRETCHED = 2.0
 """How many times as long as on level ground a photo's pixel may lie on ground that falls away."""
 ENOUGH_M = 0.01
@@ -31,25 +30,23 @@ def gentle(surface: Surface, centres: NDArray[np.float64]) -> Surface:
     over what it does not see. Their far sides are lowered and so shown leaning outwards, as on a
     map of bare ground; the ground beside them stays where it is.
     """
-    z, cell = surface.z, surface.cell
-    rows, columns = (m.astype(np.float32) for m in np.mgrid[: z.shape[0], : z.shape[1]])
+    cell = surface.cell
+    rows, columns = (m.astype(np.float32) for m in np.mgrid[: len(surface.z), : surface.z.shape[1]])
     x, y = surface.x0 + columns * cell, surface.y0 + rows * cell
     place = np.stack([x.ravel(), y.ravel()], 1)
-    mine = centres[nearest(centres[:, :2], place, 1)[1][:, 0]].reshape(*z.shape, 3)
+    mine = centres[nearest(centres[:, :2], place, 1)[1][:, 0]].reshape(*x.shape, 3)
     aside, along = x - mine[..., 0], y - mine[..., 1]
     distance = np.maximum(np.hypot(aside, along), cell)
-    outer_column = (columns + aside / distance).astype(np.float32)
-    outer_row = (rows + along / distance).astype(np.float32)
-    sight = np.maximum(mine[..., 2] - z, 0) / distance  # fall of the line of sight, m per m
+    outer = x + cell * aside / distance, y + cell * along / distance
+    sight = np.maximum(mine[..., 2] - surface.z, 0) / distance  # fall of the line of sight, m per m
     fall = ((1 - 1 / MOST_STRETCHED) * sight * cell).astype(np.float32)
-    for _ in range(max(z.shape)):
-        outer = cv2.remap(
-            z, outer_column, outer_row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
-        before, z = z, np.minimum(z, outer + fall)
-        if float((before - z).max()) < ENOUGH_M:
+    for _ in range(max(x.shape)):
+        z = np.minimum(surface.z, surface.at(*outer) + fall)
+        change = float((surface.z - z).max())
+        surface = replace(surface, z=z)
+        if change < ENOUGH_M:
             break
-    return replace(surface, z=z)
+    return surface
 
 
 class Shadow:
