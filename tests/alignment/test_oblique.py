@@ -183,6 +183,22 @@ def test_the_deviation_is_the_scatter_of_resections(wide):
     assert real / 1.5 < told < 1.5 * real
 
 
+def test_observations_without_residuals_are_as_sharp_as_pictures_are_matched():
+    """Pictures are matched at 1000 px, smaller ones as they are, to a tenth of a pixel: a photo of
+    160 px is known to the same part of a pixel as one of 1000, one of 4000 to four times as much.
+    """
+    where, xyz = pose(0, 0, pitch=12, roll=-5), hills(5000)
+    xyz = xyz[seen(where, xyz)[1]][:30]
+    told = []
+    for size in (0.16, 1.0, 4.0):
+        width, height = round(1000 * size), round(750 * size)
+        camera = Camera.ideal(width=width, height=height, focal=830.0 * size)
+        told.append(deviation_px(where, camera, xyz, np.zeros((len(xyz), 2)), None))
+    assert told[0] == pytest.approx(told[1], rel=0.02)
+    assert told[2] == pytest.approx(4 * told[1], rel=0.02)
+    assert told[0] < 0.007 * 160
+
+
 @pytest.mark.parametrize("pitch", [0.0, 45.0, 72.0])
 def test_resection_finds_the_pose_among_wrong_points(pitch):
     where, xyz = pose(3, -20, yaw=33, pitch=pitch, roll=4), hills(4000, wide=200)

@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.deviations import MATCHED
+from skyquilt.alignment.least_squares_matching import LeastSquaresMatching
 from skyquilt.alignment.setup import INDEPENDENT
 from skyquilt.geometry.camera import project_with_derivatives, rays
 from skyquilt.model.camera import Camera
@@ -259,7 +261,9 @@ def deviation_px(
     """Predicted standard deviation in px of the picture on the ground, at the worst place shown,
     from the covariance of the pose with all points held.
     """
-    spread = max(0.5, float(np.median(np.linalg.norm(residual_px, axis=1))) / 1.18)
+    # residuals of a few points are less than their errors
+    least = LeastSquaresMatching.sigma * max(camera.width / MATCHED, camera.height / MATCHED, 1.0)
+    spread = max(least, float(np.median(np.linalg.norm(residual_px, axis=1))) / 1.18)
     weight = min(1.0, INDEPENDENT / len(xyz)) / spread**2
     J = pose_derivatives(pose, camera, xyz)
     flat = J.reshape(-1, 6)
