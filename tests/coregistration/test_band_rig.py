@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -81,6 +82,38 @@ def test_a_band_that_is_exposed_later_is_told_from_a_turned_one(delay_s):
     assert found.delay_s == pytest.approx(delay_s, abs=0.003)
     assert found.share > 0.9 and found.off_px < 0.25
     assert np.median(apart_px(found, a, b, a.camera)) < 0.1
+
+
+def under_the_sun(material, shift):
+    """(h, w, 3) a picture of materials in two colours, whose light has the same edges, `shift` px
+    further right, as slopes that face the sun have.
+    """
+    light = 0.35 + 0.65 * np.roll(material, shift, 1) / 255
+    return np.stack([material, 255 - material, np.full_like(material, 128)], 2) * light[..., None]
+
+
+@pytest.mark.slow
+def test_light_beside_its_materials_does_not_move_the_thermal_camera():
+    """What is warm are materials; the light lies 1.4 px beside them in all photos."""
+    a, b = rig(1, *SIZE, FOCAL)
+    off = {}
+    for coloured in (False, True):
+        pairs = []
+        for k in range(3):
+            material = texture(700, 900, seed=k).astype(np.float32)
+            rgb = seen(under_the_sun(material, 2), WIDE, a).astype(np.uint8)
+            pairs.append(
+                Together(
+                    a=cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY),
+                    camera_a=a.camera,
+                    b=shows(material, b, negative=True),
+                    colours=rgb if coloured else None,
+                )
+            )
+        found = FindBandRig()(pairs, b.camera, 0.01)
+        assert isinstance(found, BandRig)
+        off[coloured] = np.median(apart_px(found, a, b, a.camera))
+    assert off[False] > 1.0 and off[True] < 0.2, off
 
 
 def test_a_camera_is_found_beside_the_other_where_the_depth_changes():

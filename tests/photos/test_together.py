@@ -47,6 +47,13 @@ def test_by_times_each_photo_once():
     assert taken_together(a, b) == [(0, 0), (1, 1), (2, 2), (3, 3)]
 
 
+def test_of_a_fast_camera_the_photo_nearest_in_time_counts():
+    """It exposes five times a second, and began before the other one."""
+    a = [photo(f"A{k}.JPG", 2.0 * k + 0.61) for k in range(4)]
+    b = [photo(f"B{100 + k}.JPG", 0.2 * k) for k in range(40)]
+    assert taken_together(a, b) == [(0, 3), (1, 13), (2, 23), (3, 33)]
+
+
 def test_equal_names_of_another_flight_are_chance():
     a = [photo(f"SIM_{k}.jpg", 3.0 * k) for k in range(4)]
     assert taken_together(a, [photo(f"SIM_{k}.jpg", 3.0 * k + 3600) for k in range(4)]) == []

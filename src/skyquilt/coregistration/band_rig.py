@@ -9,6 +9,10 @@ red and bright in the infrared (`coregistration.orientation`). The lens of the b
 the rotation: what the lens of the other photos leaves out, it takes up, so that all bands lie on
 each other on the map. The place shows in how the shift changes with the depth of the ground: on
 level ground it does not, and there the rotation takes up all of it.
+
+Sunlight on rough ground lays edges of brightness beside those of materials, all to one side, while
+warmth lies where the sun shone before. So where the map's photos have colours and patches of these
+confirm the rig, its rotation is theirs (`coregistration.refine_registration` does so for maps).
 """
 
 import itertools
@@ -133,7 +137,7 @@ class FindBandRig:
     """Share of the largest velocity by which that of a pair must differ from the mean of all along
     the axes of the camera for a delay to be told from a rotation.
     """
-    version: ClassVar[int] = 6
+    version: ClassVar[int] = 7
 
     def __call__(
         self,
@@ -168,11 +172,12 @@ class FindBandRig:
                 reason=f"{agree.mean():.0%} of the patches of its photos agree on one camera beside"
                 " that of the map's photos"
             )
+        exact = self._by_colours(pairs, there, camera_b, fields, sigma_focal)
         return BandRig(
-            b_R_a=there.R,
-            a_t_b=np.array([*there.place, 0.0]),
-            camera=there.camera,
-            delay_s=there.delay_s,
+            b_R_a=exact.R,
+            a_t_b=np.array([*exact.place, 0.0]),
+            camera=exact.camera,
+            delay_s=exact.delay_s,
             pairs=len(pairs),
             agreeing=sum(
                 bool(agree[found.pair == k].mean() >= self.least_share)
@@ -182,6 +187,10 @@ class FindBandRig:
             share=float(agree.mean()),
             off_px=self._kept_out(found, there, camera_b, sigma_focal),
         )
+
+    def _round(self, step: int) -> tuple[tuple[str, ...], int]:
+        """What of the lens a round fits, and the side that photos are reduced to in it."""
+        return _FREE[: _OF_ROUND[step]], self.sides[step]
 
     def _ways_differ(self, pairs: Sequence[Together]) -> bool:
         """Whether the map's camera was flown in several ways along its own axes (it does not turn
@@ -214,7 +223,7 @@ class FindBandRig:
             for start in starts:
                 found = self._matched(seen, start, reach, apart)
                 if len(found.px_a):
-                    fits = self._fitted(found, start, told, step, sigma_focal, late)
+                    fits = self._fitted(found, start, told, self._round(step), sigma_focal, late)
                     off = np.nan_to_num(_off(found, fits) / _scale(told, side), nan=np.inf)
                     if best is None or self._agree(off) > self._agree(best[2]):
                         best = fits, found, off
@@ -222,6 +231,27 @@ class FindBandRig:
                 return None
             starts = [best[0]]
         return best
+
+    def _by_colours(
+        self,
+        pairs: Sequence[Together],
+        there: Beside,
+        told: Camera,
+        fields: Callable[[int, int], Orientation],
+        sigma_focal: float,
+    ) -> Beside:
+        """The camera turned to where colours have it; as it was where they do not confirm that."""
+        side = self.sides[-1]
+        seen = [(k, p, fields(k, side)) for k, p in enumerate(pairs) if p.colours is not None]
+        if len(seen) < self.minimum:
+            return there
+        found = self._matched(seen, there, self.reach[-1], self.apart[-1], coloured=True)
+        if not len(found.px_a):
+            return there
+        late = there.delay_s != 0
+        turned_ = self._fitted(found, there, told, ((), side), sigma_focal, late)
+        agree = _off(found, turned_) / _scale(told, side) < self.agree_px
+        return turned_ if agree.mean() >= self.least_share else there
 
     def _agree(self, off: Array) -> int:
         """How many patches, off by px (n,) of a reduced photo, agree with a rig."""
@@ -233,14 +263,16 @@ class FindBandRig:
         there: Beside,
         reach: int,
         apart: float,
+        *,
+        coloured: bool = False,
     ) -> _Matched:
         """Patches of pairs (with their index, and the fields of the band's photo), matched around
-        where the camera so far has them.
+        where the camera so far has them; `coloured`: by the colours of the map's photos.
         """
         rows = []
         for k, pair, b in pairs:
             small = there.reduced(b.shape)
-            a = seen_by(pair, there, b.shape)
+            a = seen_by(pair, there, b.shape, coloured=coloured)
             px, shift = _shifts(a, b, reach, apart)
             full = there.camera.height, there.camera.width
             px_b = full_px(px + shift, b.shape, full)
@@ -264,13 +296,15 @@ class FindBandRig:
         found: _Matched,
         start: Beside,
         told: Camera,
-        step: int,
+        round_: tuple[tuple[str, ...], int],
         sigma_focal: float,
         late: bool,
     ) -> Beside:
-        """The camera that fits best in a round; `late`: and its delay."""
-        free = _FREE[: _OF_ROUND[step]]
-        sigma = self.scatter_px * _scale(told, self.sides[step])
+        """The camera that fits best in a round (what of its lens is fitted, and the side that
+        photos are reduced to); `late`: and its delay.
+        """
+        free, side = round_
+        sigma = self.scatter_px * _scale(told, side)
         spread = _deviations(told, sigma_focal)
         ray_a = rays(found.camera_a, found.px_a)
 
@@ -302,9 +336,8 @@ class FindBandRig:
         for half in (0, 1):
             part, rest = (found.only(k) for k in (found.pair % 2 == half, found.pair % 2 != half))
             if len(part.px_a) and len(rest.px_a):
-                step = len(_OF_ROUND) - 1
-                late = there.delay_s != 0
-                off.append(_off(part, self._fitted(rest, there, told, step, sigma_focal, late)))
+                last, late = self._round(len(_OF_ROUND) - 1), there.delay_s != 0
+                off.append(_off(part, self._fitted(rest, there, told, last, sigma_focal, late)))
         return float(np.median(np.concatenate(off))) if off else float("nan")
 
 

@@ -11,7 +11,8 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from skyquilt.coregistration.agreement import scores
-from skyquilt.coregistration.orientation import Orientation, orientation
+from skyquilt.coregistration.orientation import Orientation, of_bands, orientation
+from skyquilt.coregistration.refine_registration import chromaticity
 from skyquilt.geometry.camera import project, rays
 from skyquilt.geometry.frames import rotation_from_vector
 from skyquilt.imaging.grey import shrunken_px
@@ -44,6 +45,8 @@ class Together:
     """
     velocity: Array = field(default_factory=lambda: np.zeros(3))
     """(3,) of the map's camera along its own axes, m/s; 0 where it is not known."""
+    colours: NDArray[np.uint8] | None = None
+    """(H, W, 3) what `a` shows in colours; None where it has none, or they are not wanted."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -140,8 +143,12 @@ def _at(pair: Together, px_a: Array) -> Array:
     return np.asarray(found, np.float64)
 
 
-def seen_by(pair: Together, beside: Beside, shape: tuple[int, int]) -> Orientation:
-    """The fields of the map's photo as the reduced band (h, w) sees it."""
+def seen_by(
+    pair: Together, beside: Beside, shape: tuple[int, int], *, coloured: bool = False
+) -> Orientation:
+    """The fields of the map's photo as the reduced band (h, w) sees it; `coloured`: those of its
+    colours, whatever the brightness.
+    """
     h, w = shape
     small = beside.reduced(shape)
     rows, columns = (np.arange(0, n + _NODE, _NODE, dtype=np.float64) for n in (h, w))
@@ -155,12 +162,16 @@ def seen_by(pair: Together, beside: Beside, shape: tuple[int, int]) -> Orientati
     )
     u, v = (cv2.remap(place.astype(np.float32), map_x, map_y, cv2.INTER_LINEAR) for place in places)
     source: NDArray[Any] = pair.a
+    if coloured and pair.colours is not None:
+        source = pair.colours.astype(np.float32)
     finer = max(pair.a.shape) / max(h, w) / 1.1
     if finer > 1.5:  # as fine as the band, or fine structure would be aliased
-        source = cv2.GaussianBlur(pair.a, (0, 0), 0.4 * finer)
+        source = cv2.GaussianBlur(source, (0, 0), 0.4 * finer)
     seen = cv2.remap(source, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     height, width = pair.a.shape
     valid = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
+    if seen.ndim == 3:
+        return of_bands(chromaticity(seen), valid, np.eye(3), quick=True)
     return orientation(seen.astype(np.float32), valid, float(np.sqrt(seen.size)), quick=True)
 
 

@@ -25,8 +25,9 @@ def taken_together(a: Sequence[Photo], b: Sequence[Photo]) -> list[tuple[int, in
     """Pairs (index of a, index of b), each photo in at most one, by ascending index of b.
 
     Photos are paired by equal numbers in the names, where neither times nor positions contradict;
-    photos without a partner by name are paired by the nearest time. Of photos of several cameras
-    taken at once (wide and zoom), the one with the widest view counts.
+    photos without a partner by name are paired by time, the nearest first: of a camera that
+    exposes several times a second, the photo nearest to the other camera's counts. Of photos of
+    several cameras taken at once (wide and zoom), the one with the widest view counts.
     """
     named: dict[tuple[str, ...], list[int]] = {}
     for i, photo in enumerate(a):
@@ -36,18 +37,17 @@ def taken_together(a: Sequence[Photo], b: Sequence[Photo]) -> list[tuple[int, in
         same = _widest(a, named.get(_numbers(photo), [])) if _numbers(photo) else []
         if len(same) == 1 and same[0] not in found.values() and _possible(a[same[0]], photo):
             found[j] = same[0]
-    left = [i for i in range(len(a)) if i not in found.values()]
-    for j, photo in enumerate(b):
-        gaps = [(gap, _narrow(a[i]), i) for i in left if (gap := _gap_s(a[i], photo)) is not None]
-        if (
-            j in found
-            or not gaps
-            or min(gaps)[0] > SECONDS
-            or not _possible(a[min(gaps)[-1]], photo)
-        ):
-            continue
-        found[j] = min(gaps)[-1]
-        left.remove(found[j])
+    taken, rest = set(found.values()), [j for j in range(len(b)) if j not in found]
+    near = sorted(
+        (gap, _narrow(a[i]), i, j)
+        for i in range(len(a))
+        for j in rest
+        if i not in taken and (gap := _gap_s(a[i], b[j])) is not None and gap <= SECONDS
+    )
+    for _, _, i, j in near:
+        if i not in taken and j not in found and _possible(a[i], b[j]):
+            found[j] = i
+            taken.add(i)
     return [(found[j], j) for j in sorted(found)]
 
 

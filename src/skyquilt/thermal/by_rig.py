@@ -51,6 +51,11 @@ _AGREE = 0.75
 """Share of registered pairs below which it is told that others do not agree with them."""
 _TOLD_S = 0.05
 """Delay of the thermal camera that is told, s."""
+_DOUBLED = (
+    "the visual photo taken together with it is beside one of another thermal camera; map each"
+    " thermal camera by itself"
+)
+"""Why photos of a second thermal camera are not drawn."""
 _GRID = 6
 """Points per side of the grid from which the rotation of a registered pair is computed."""
 
@@ -87,10 +92,12 @@ class Rigged:
 def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistration:
     """Places thermal photos by visual poses, or gives the reason why this is not possible."""
     visual, placed = scene.aligned.photos, scene.aligned.alignment
-    paired = taken_together(visual, thermal)
-    together = [(i, j) for i, j in paired if i in placed.poses]
-    beside = {j: i for i, j in paired}
-    alone = without_partner(thermal, beside, placed.poses, "visual photo")
+    beside, doubled = _beside(visual, thermal)
+    together = [(i, j) for j, i in sorted(beside.items()) if i in placed.poses]
+    alone = [
+        RejectedPhoto(name=p.name, reason=_DOUBLED) if p.name in doubled else p
+        for p in without_partner(thermal, beside, placed.poses, "visual photo")
+    ]
     bad = {j: r for _, j in together if (r := _undecodable(thermal[j])) is not None}
     pairs = [(i, j) for i, j in together if j not in bad]
     if len(pairs) < FindRig.minimum:
@@ -134,6 +141,27 @@ def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistrati
     return Rigged(rig=rig, photos=photos, alignment=alignment, rejected=(*bad.values(), *alone))
 
 
+def _beside(
+    visual: Sequence[Photo], thermal: Sequence[Photo]
+) -> tuple[dict[int, int], frozenset[str]]:
+    """Index of a thermal photo -> that of the visual one taken together with it, and the names of
+    those whose visual photo is beside one of another camera, of which there are more.
+    """
+    of_camera: dict[str, list[int]] = {}
+    for j, photo in enumerate(thermal):
+        of_camera.setdefault(photo.camera_key, []).append(j)
+    found = [
+        {own[k]: i for i, k in taken_together(visual, [thermal[j] for j in own])}
+        for own in of_camera.values()
+    ]
+    beside, doubled = dict[int, int](), set[str]()
+    for pairs in sorted(found, key=len, reverse=True):
+        taken = set(beside.values())
+        beside |= {j: i for j, i in pairs.items() if i not in taken}
+        doubled |= {thermal[j].name for j, i in pairs.items() if i in taken}
+    return beside, frozenset(doubled)
+
+
 def _with_lens(
     scene: Scene,
     thermal: Sequence[Photo],
@@ -146,7 +174,7 @@ def _with_lens(
     nothing. A strong lens keeps these from being registered by a homography.
     """
     first, near = thermal[pairs[0][1]], None
-    seen = seen_together(scene, far(scene, pairs), thermal, velocity, MOST_PAIRS)
+    seen = seen_together(scene, far(scene, pairs), thermal, velocity, MOST_PAIRS, coloured=True)
     if isinstance(rig, Rig):
         turn = np.asarray(Rotation.from_matrix(rig.b_R_a).as_rotvec())
         near = Beside(turn=turn, place=rig.a_t_b[:2], camera=rig.camera_b, delay_s=rig.delay_s)

@@ -52,21 +52,24 @@ def seen_together(
     photos: Sequence[Photo],
     velocities: Mapping[int, NDArray[np.float64]],
     most: int,
+    *,
+    coloured: bool = False,
 ) -> list[Together]:
     """Pictures of at most so many pairs, spread evenly over the flight, without those whose file
     cannot be read. A pair: indices of the map's photo and of one of `photos`; `velocities` (3,) of
-    the former, m/s in the map frame.
+    the former, m/s in the map frame. `coloured`: with the colours of the map's photos.
     """
     asked = [pairs[k] for k in evenly(len(pairs), most)]
-    found = (_together(scene, i, photos[j], velocities[i]) for i, j in asked)
+    found = (_together(scene, i, photos[j], velocities[i], coloured) for i, j in asked)
     return [pictures for pictures in found if pictures is not None]
 
 
 def _together(
-    scene: Scene, index: int, other: Photo, velocity: NDArray[np.float64]
+    scene: Scene, index: int, other: Photo, velocity: NDArray[np.float64], coloured: bool
 ) -> Together | None:
     """Pictures of one capture; None where its file cannot be read."""
     aligned = scene.aligned
+    kind = aligned.photos[index].channels, aligned.photos[index].dtype
     try:
         grey = to_grey8(read_color(other))
     except Exception:  # whatever it is, it concerns this photo alone; told when it is drawn
@@ -78,6 +81,9 @@ def _together(
         b=shrink(grey, LONGEST)[0],
         nearness=_nearness(scene, index),
         velocity=aligned.alignment.poses[index].cam_R_map @ velocity,
+        colours=shrink(aligned.pixels(index), LONGEST)[0]
+        if coloured and kind == (3, "uint8")
+        else None,
     )
 
 
