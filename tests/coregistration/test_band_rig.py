@@ -85,16 +85,19 @@ def test_a_band_that_is_exposed_later_is_told_from_a_turned_one(delay_s):
 
 
 def under_the_sun(material, shift):
-    """(h, w, 3) a picture of materials in two colours, whose light has the same edges, `shift` px
-    further right, as slopes that face the sun have.
+    """(h, w, 3) a picture of materials in two colours, whose light has the same edges, up to
+    `shift` px further right, as slopes that face the sun have: the further, the rougher they are.
     """
-    light = 0.35 + 0.65 * np.roll(material, shift, 1) / 255
+    rough = cv2.GaussianBlur(texture(*material.shape, seed=9).astype(np.float32), (0, 0), 30)
+    x, y = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in material.shape[::-1]))
+    beside = shift * (rough - rough.min()) / np.ptp(rough)
+    light = 0.35 + 0.65 * cv2.remap(material, x - beside, y, cv2.INTER_LINEAR) / 255
     return np.stack([material, 255 - material, np.full_like(material, 128)], 2) * light[..., None]
 
 
 @pytest.mark.slow
 def test_light_beside_its_materials_does_not_move_the_thermal_camera():
-    """What is warm are materials; the light lies 1.4 px beside them in all photos."""
+    """What is warm are materials; the light lies up to 1.4 px beside them in all photos."""
     a, b = rig(1, *SIZE, FOCAL)
     off = {}
     for coloured in (False, True):
@@ -113,7 +116,7 @@ def test_light_beside_its_materials_does_not_move_the_thermal_camera():
         found = FindBandRig()(pairs, b.camera, 0.01)
         assert isinstance(found, BandRig)
         off[coloured] = np.median(apart_px(found, a, b, a.camera))
-    assert off[False] > 1.0 and off[True] < 0.2, off
+    assert off[False] > 1.0 and off[True] < off[False] / 4, off
 
 
 def test_a_camera_is_found_beside_the_other_where_the_depth_changes():

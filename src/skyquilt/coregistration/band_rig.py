@@ -137,6 +137,11 @@ class FindBandRig:
     """Share of the largest velocity by which that of a pair must differ from the mean of all along
     the axes of the camera for a delay to be told from a rotation.
     """
+    colours_off: float = 2.0
+    """Times the median distance of patches of brightness from the rig that those of colours may lie
+    off for these to count. Light lies beside materials by more on rougher ground: where brightness
+    is all of one mind, as that of a single camera's bands is, it is not the light's.
+    """
     version: ClassVar[int] = 7
 
     def __call__(
@@ -172,7 +177,7 @@ class FindBandRig:
                 reason=f"{agree.mean():.0%} of the patches of its photos agree on one camera beside"
                 " that of the map's photos"
             )
-        exact = self._by_colours(pairs, there, camera_b, fields, sigma_focal)
+        exact = self._by_colours(best, pairs, camera_b, fields, sigma_focal)
         return BandRig(
             b_R_a=exact.R,
             a_t_b=np.array([*exact.place, 0.0]),
@@ -234,13 +239,16 @@ class FindBandRig:
 
     def _by_colours(
         self,
+        best: tuple[Beside, _Matched, Array],
         pairs: Sequence[Together],
-        there: Beside,
         told: Camera,
         fields: Callable[[int, int], Orientation],
         sigma_focal: float,
     ) -> Beside:
-        """The camera turned to where colours have it; as it was where they do not confirm that."""
+        """The camera turned to where colours have it; as brightness has it (`best`) where patches
+        do not confirm that, or agree on it far less closely than those of brightness do.
+        """
+        there, _, by_light = best
         side = self.sides[-1]
         seen = [(k, p, fields(k, side)) for k, p in enumerate(pairs) if p.colours is not None]
         if len(seen) < self.minimum:
@@ -250,8 +258,9 @@ class FindBandRig:
             return there
         late = there.delay_s != 0
         turned_ = self._fitted(found, there, told, ((), side), sigma_focal, late)
-        agree = _off(found, turned_) / _scale(told, side) < self.agree_px
-        return turned_ if agree.mean() >= self.least_share else there
+        off = _off(found, turned_) / _scale(told, side)
+        close = np.median(off) < self.colours_off * np.median(by_light)
+        return turned_ if close and (off < self.agree_px).mean() >= self.least_share else there
 
     def _agree(self, off: Array) -> int:
         """How many patches, off by px (n,) of a reduced photo, agree with a rig."""
