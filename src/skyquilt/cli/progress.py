@@ -203,7 +203,7 @@ def mosaic_summary(result: Result) -> str:
     lines += [f"warning: {told}" for told in m.get("warnings", [])]
     if m["metadata_conflicts"]:
         lines.append(
-            f"{len(m['metadata_conflicts'])} contradictions between metadata and images: see the"
+            f"contradictions between metadata and images: {len(m['metadata_conflicts'])}, see the"
             " report"
         )
     lines.append(
