@@ -217,3 +217,22 @@ def test_files_that_were_turned_count_by_their_sensors():
     )
     (note,) = common_tilts(found, told, ["c"] * len(told))[1]
     assert "look 1.9 degrees aside" in note or "look 2." in note
+
+
+@pytest.mark.parametrize(("fit", "corrected"), [(1.0, True), (1.07, False)])
+def test_an_error_of_a_gimbal_that_pictures_contradict_is_not_corrected(fit, corrected):
+    """False heights of a line look like one; photos then fit worse where they are turned by it."""
+    found, told = lines((0, 0, 0), ahead_deg=5.0, map_deg=5.0)
+    right = lines((0, 0, 0), ahead_deg=5.0)[0]
+
+    def residuals(aligned, px):
+        ties = replace(aligned.ties, residual_px=np.full(aligned.ties.px.shape, px))
+        return replace(aligned, ties=ties)
+
+    survey = repairs.Survey(
+        names=[], cameras=["c"] * len(told), speeds=None, linked=len(told),
+        adjust=lambda begun: residuals(right, 0.1 * fit), unfit=None, cut=None, focals=None,
+        beginnings=None, guess=None,
+    )  # fmt: skip
+    first = repairs.Tried(found=residuals(found, 0.1), begun=repairs.Beginning(priors=told))
+    assert (repairs._common_tilts(first, survey) is not first) == corrected

@@ -9,6 +9,7 @@ import pytest
 import rasterio
 from PIL import Image
 
+from skyquilt.geometry.frames import cam_R_map_from_angles
 from skyquilt.imaging.blank import around, joined
 from skyquilt.imaging.views import make_views, native_gsd
 from skyquilt.ortho.lasting_marks import _hardly_varying, _is_mark
@@ -198,6 +199,26 @@ def test_what_a_hover_shows_at_one_place_is_no_dust():
     taken = pictures(alignment)
     for k in hover:
         taken[k][130:160, 190:240] //= 2
+    assert shown(alignment, taken) == ({}, ())
+
+
+def test_what_photos_circle_around_is_no_dust():
+    """Sixteen photos around a dark tower, whose top each shows before the ground beyond it."""
+    alignment = flight(16, apart=6.0)
+    middle = np.mean([p.map_C for p in alignment.poses.values()], axis=0)
+    high = middle[2]
+    poses = {}
+    for k in range(16):
+        turn = np.radians(22.5 * k)
+        C = middle + 0.5 * high * np.array([np.sin(turn), np.cos(turn), 0.0])
+        tilt = float(np.degrees(np.arctan(0.5)))
+        R = cam_R_map_from_angles(22.5 * k + 180.0, tilt)
+        poses[k] = replace(alignment.poses[k], cam_R_map=R, map_C=C)
+    alignment = replace(alignment, poses=poses)
+    taken = pictures(alignment)
+    assert shown(alignment, taken) == ({}, ())
+    for picture in taken.values():
+        picture[95:135, 180:220] //= 2
     assert shown(alignment, taken) == ({}, ())
 
 

@@ -292,12 +292,16 @@ def _outvoted_positions(last: Tried, survey: Survey) -> Tried:
 
 
 def _common_tilts(last: Tried, survey: Survey) -> Tried:
-    """Tilts with an error that all photos of a camera have in common are corrected by it."""
+    """Tilts with an error that all photos of a camera have in common are corrected by it. False
+    heights look like such an error, too, but then pictures contradict it.
+    """
     priors = last.begun.priors
     corrected, notes = common_tilts(last.found, priors, survey.cameras)
     if not notes:
         return last
     other = survey.tried(last.begun, priors=corrected, name="common tilts ")
+    if not fits_as_well(other.found, last.found):
+        return last
     as_told = off_told(other.found, corrected) < MORE_ALIKE * off_told(last.found, priors)
     if as_told or off_positions(other.found, priors) < off_positions(last.found, priors):
         return replace(other, notes=(*last.notes, *notes))

@@ -49,9 +49,9 @@ assumed, and that of what pictures alone tell.
 DOUBTFUL = 0.02
 """A guessed focal length that a flight leaves as uncertain as this share of it may be another one.
 """
-FAR, FAR_AGAIN = 1.4, 1.1
-"""Factors by which it must be another one then, where it was guessed first and again: less is
-within what a guess allows, or of no effect.
+FAR, FAR_OPEN = 1.4, 1.1
+"""Factors by which it must be another one then: where pictures settle it, less is within what a
+guess allows; where they leave it open, or it was begun again, less is of no effect.
 """
 MOST_FAR = 12.0
 """Factor by which it can be another one."""
@@ -191,7 +191,8 @@ def other_focals(
         if settled and not pulled and not _fits_none(found, key):
             continue
         towards = camera.focal / (guess.px * before)
-        if max(towards, 1 / towards) <= (FAR_AGAIN if key in begun else FAR):
+        far = FAR if settled and key not in begun else FAR_OPEN
+        if max(towards, 1 / towards) <= far:
             continue
         further = towards * min(max(towards, 0.5), 2.0)  # what it began with still holds it back
         if not settled:
@@ -217,9 +218,11 @@ def _open(camera: Camera) -> bool:
 
 
 def focal_notes(found: Alignment, multiples: Mapping[str, float]) -> list[str]:
-    """What the user is told of each camera."""
+    """What the user is told of each camera with a lens that is not usual."""
     notes = []
-    for key in sorted(multiples):
+    for key, factor in sorted(multiples.items()):
+        if max(factor, 1 / factor) <= FAR:
+            continue
         camera = found.cameras[key]
         wide = 2 * float(np.degrees(np.arctan(camera.width / 2 / camera.focal)))
         said = (

@@ -42,6 +42,10 @@ APART = 0.03
 """Two photos of a camera are compared whose places differ by more than this share of their height,
 about.
 """
+MOVES = 0.7
+"""The ground behind a spot on the lens extends over at least this share of the extent of the
+places that photos were taken from; that behind a house that they circle around hardly moves.
+"""
 WITHIN, FEWEST_VALUES = 9, 8
 """Cells along a side of these, and fewest values of a cell."""
 RINGS = 12
@@ -256,6 +260,7 @@ def find_spots(
         if not here.any():  # no ground is shown by three photos
             continue
         spot = _spots(samples.place[here], darker[here], size)
+        spot = _on_other_ground(spot, [apart[k] for k in np.flatnonzero(own)], size, flat)
         if spot.any():
             mark = around(np.kron(spot, np.ones((FINER, FINER))) > 0, size)
             found |= {v.photo: mark for v in views if alignment.camera_of[v.photo] == name}
@@ -333,6 +338,31 @@ def _spots(
     together = cv2.filter2D(dark.view(np.uint8), -1, square, borderType=cv2.BORDER_CONSTANT)
     spot = cv2.dilate((dark & (together > 1)).view(np.uint8), square) > 0
     return spot if spot.mean() <= LARGEST_SPOT else np.zeros_like(spot)
+
+
+def _on_other_ground(
+    spot: NDArray[np.bool_], views: Sequence[View], size: tuple[int, int], flat: Surface
+) -> NDArray[np.bool_]:
+    """The parts of a spot (rows, columns) that lie on other ground from view to view: what photos
+    circle around lies at the same place of each, too.
+    """
+    number, part = cv2.connectedComponents(spot.view(np.uint8))
+    centres = np.array([v.pose.map_C[:2] for v in views])
+    kept = np.zeros_like(spot)
+    for k in range(1, number):
+        rows, columns = np.nonzero(part == k)
+        box = np.array([[columns.min(), rows.min()], [columns.max() + 1, rows.max() + 1]])
+        px = box * np.array(size) / spot.shape[::-1] - 0.5
+        ground = np.array([on_ground(v, px, flat)[:, :2].mean(0) for v in views])
+        sky = ~np.isfinite(ground).all(1)
+        if not sky.all() and _extent(ground[~sky]) >= MOVES * _extent(centres[~sky]):
+            kept |= part == k
+    return kept
+
+
+def _extent(places: NDArray[np.float64]) -> float:
+    """Median distance of places (n, 2) from their middle."""
+    return float(np.median(np.linalg.norm(places - places.mean(0), axis=1)))
 
 
 def _shares(place: NDArray[Any], size: tuple[int, int]) -> NDArray[np.float64]:
