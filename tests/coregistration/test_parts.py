@@ -1,5 +1,7 @@
 """The parts of the search, each against a slow loop, another library or an algebraic property."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -15,9 +17,10 @@ from skyquilt.coregistration.candidates import (
     same_view,
     similarity,
 )
-from skyquilt.coregistration.decision import distinctness
+from skyquilt.coregistration.decision import Decide, distinctness
 from skyquilt.coregistration.everywhere import Everywhere, _Plane, highest
 from skyquilt.coregistration.orientation import (
+    Pyramid,
     between,
     full_size,
     orientation,
@@ -25,6 +28,7 @@ from skyquilt.coregistration.orientation import (
     turned,
     warped,
 )
+from skyquilt.coregistration.repeats import Repeats
 from skyquilt.coregistration.subpixel import SubpixelRefinement
 from skyquilt.coregistration.usable import usable
 from skyquilt.model.registration import Picture
@@ -288,3 +292,49 @@ def test_faults_of_single_pixels_and_lines_are_no_picture(scene):
     assert (~found.valid).sum() == 40 * 60 and not found.valid[300:340, 100:160].any()
     near = np.abs(found.grey - values)[found.valid]
     assert np.mean(near > 0.5) < 0.01 and near.max() < 12
+
+
+def crossing(seed):
+    """(480, 640) brightness of two roads at right angles; the ground beside them is random."""
+    rng = np.random.default_rng(seed)
+    grounds = [cv2.GaussianBlur(rng.normal(size=(480, 640)), (0, 0), s) for s in (2, 5, 12)]
+    picture = 105 + 0.5 * sum(g / g.std() for g in grounds)
+    for corner, end in (((0, 165), (640, 285)), ((240, 0), (360, 480))):
+        cv2.rectangle(picture, corner, end, 30.0, -1)
+        cv2.rectangle(picture, corner, end, 200.0, 2)
+    return picture
+
+
+def test_crossings_of_other_roads_confirm_nothing():
+    """Patches along the two roads agree as well as those of one place; those beside them do not."""
+    one, other = (np.clip(crossing(k), 0, 255).astype(np.uint8) for k in range(2))
+    one, negative, other = (
+        usable(Picture(values=values)) for values in (one, 255 - one, 255 - other)
+    )
+    pyramid = Pyramid(a=one, b=other, sides=(256.0,))
+    there = SubpixelRefinement()(*pyramid.at(pyramid.last), np.eye(3))
+    found = Agree()(*pyramid.at(pyramid.last), there.b_H_a)
+    assert found.surprise > 5 and found.beside_edges < 2
+    refused = Decide()(pyramid, [there])
+    assert not refused and "straight edges" in refused.reason
+    own = Pyramid(a=one, b=negative, sides=(256.0,))
+    assert Decide()(own, [SubpixelRefinement()(*own.at(own.last), np.eye(3))])
+
+
+def test_another_place_need_have_no_patch_in_common(scene):
+    """What a shows is twice in b, left and right."""
+    strip, rng = scene[:, :150].astype(np.float32), np.random.default_rng(3)
+    b = np.full(SHAPE, 128, np.float32)
+    b[:, :150], b[:, -150:] = strip, strip
+    noise = [rng.normal(0, 4, s) for s in (strip.shape, SHAPE)]
+    a, b = (
+        of(np.clip(p + n, 0, 255).astype(np.uint8), s)
+        for p, n, s in zip((strip, b), noise, (256 * np.sqrt(150 / 480), 256.0), strict=True)
+    )
+    at = between(a, b, np.eye(3))
+    rival = Repeats()(a, b, at, Agree())
+    assert rival is not None
+    assert rival.shift == pytest.approx((330 * b.small_S_full[0, 0], 0), abs=1)
+    once = b.fields.copy()
+    once[:, -int(0.4 * b.shape[1]) :] = 0
+    assert Repeats()(a, replace(b, fields=once), at, Agree()) is None

@@ -183,4 +183,4 @@ def test_pictures_that_are_not_known_to_be_thermal_are_told(flight, photos, tmp_
         path.write_bytes(path.read_bytes() + b"\0")  # the same photos twice are refused
     events = iter_thermal(flight / "photos", photos, tmp_path / "out", SETTINGS)
     first = next(events)
-    assert isinstance(first, Note) and first.warning and "known to be thermal" in first.text
+    assert isinstance(first, Note) and first.warning and "says that it is thermal" in first.text

@@ -290,6 +290,19 @@ def test_a_visible_picture_of_a_rig_that_says_lwir(make_jpeg, width, band):
     assert read_photo(make_jpeg(xmp=xmp, image=image)).band == band
 
 
+@pytest.mark.parametrize(
+    ("source", "band"), [("InfraredCamera", "thermal"), ("WideCamera", "visible"), ("", "visible")]
+)
+def test_a_picture_of_djis_infrared_camera(make_jpeg, source, band):
+    """Models that no table lists, without raw data: they say which camera took it."""
+    space = 'xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/"'
+    xmp = packet("", f'{space} drone-dji:ImageSource="{source}"')
+    photo = read_photo(make_jpeg(xmp=xmp, image=np.zeros((512, 640, 3), np.uint8)))
+    assert photo.band == band
+    # the guess for a lens that nothing tells is that for such cameras
+    assert photo.focal.px == pytest.approx({"thermal": 1.15, "visible": 0.75}[band] * 640)
+
+
 def test_a_date_of_gps_with_a_time(make_jpeg):
     gps = gps_exif(46.5, 9.0) | {7: ((15, 1), (28, 1), (54, 1)), 29: "2017:09:16 15:28:54"}
     exif = {"0th": {}, "Exif": {}, "GPS": gps}

@@ -73,3 +73,22 @@ def test_the_thermal_photos_twice_are_refused(folder, tmp_path):
         path.unlink()
     with pytest.raises(UsageError, match="all are thermal; for a map of them alone"):
         list(iter_thermal(folder, folder, tmp_path / "out", MosaicSettings()))
+
+
+def test_pictures_that_nobody_but_the_user_calls_thermal(folder, tmp_path, monkeypatch):
+    """Pictures of a palette by a camera that no table lists were taken for visible photos: for
+    overexposed where it is warm, with a lens as visible cameras have.
+    """
+    alone = tmp_path / "heat"
+    alone.mkdir()
+    for path in folder.glob("*_W.tif"):
+        path.rename(alone / path.name)
+    for path in folder.glob("*_T.tif"):
+        path.unlink()
+    keyed = []
+    monkeypatch.setattr(workflow, "_key", lambda _, heats, __: keyed.extend(heats[0].survey.photos))
+    _, heat, said = mapped(monkeypatch, folder, alone, tmp_path / "out")
+    assert heat == [f"DJI_{k:04d}_W.tif" for k in range(3)]
+    assert [p.band for p in keyed] == ["thermal"] * 3
+    assert {p.focal.px for p in keyed} == {1.15 * 80}  # the guess for thermal cameras
+    assert any("says that it is thermal" in t for t in said)

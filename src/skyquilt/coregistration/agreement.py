@@ -8,7 +8,7 @@ thousands, this number is no longer a probability; the values that occur by chan
 measured on unrelated images (docs/methods.md).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -46,6 +46,11 @@ class Agreement:
 
     surprise: float
     """-log10 of Fisher's p-value, averaged over all patch sizes."""
+    beside_edges: float
+    """The same without patches that match as well further along a straight edge. Roads or borders
+    of fields at right angles lie on each other in any two pictures that have them, and all patches
+    along one confirm that at once, as if they were independent.
+    """
     patches: int
     """Number of patches of the smaller size that were tested."""
     px: NDArray[np.float64]
@@ -68,23 +73,29 @@ class Agree:
     """Largest distance in px from the registered position at which a patch agrees."""
     filled: float = 0.6
     """Least share of a patch that both images must cover."""
-    version: ClassVar[int] = 1
+    straight: float = 0.6
+    """Height of a patch's correlation further along its peak, as a share of that of the peak, from
+    which it is that of a straight edge.
+    """
+    version: ClassVar[int] = 2
 
     def __call__(self, a: Orientation, b: Orientation, b_H_a: Matrix) -> Agreement:
         """Tests a transform in px of this resolution."""
         fields, valid = warped(a, b_H_a, b.shape)
         both = valid * b.valid
-        surprises, rows, count = [], [], 0
+        surprises, beside, rows, count = [], [], [], 0
         for across in self.across:
             found = list(self._patches(fields, b.fields, both, across))
             ranks = np.array([f[0] for f in found])
             surprises.append(_fisher(ranks))
+            beside.append(_fisher(ranks[[f[1] < self.straight for f in found]]))
             if across == self.across[0]:
-                rows, count = [f[1:] for f in found], len(found)
+                rows, count = [f[2:] for f in found], len(found)
         table = np.array(rows, np.float64).reshape(-1, 5)
         near = table[np.hypot(table[:, 2], table[:, 3]) <= self.near]
         return Agreement(
             surprise=float(np.mean(surprises)),
+            beside_edges=float(np.mean(beside)),
             patches=count,
             px=near[:, :2],
             shift=near[:, 2:4],
@@ -99,7 +110,7 @@ class Agree:
         across = self.across[0]
         half = int(np.sqrt(b.shape[0] * b.shape[1]) / across) // 2
         found = [
-            f[1:]
+            f[2:]
             for first in (0, half)
             for f in self._patches(fields, b.fields, valid * b.valid, across, first)
         ]
@@ -107,13 +118,16 @@ class Agree:
 
     def _patches(
         self, fields: Fields, target: Fields, both: NDArray[Any], across: int, first: int = 0
-    ) -> Iterator[tuple[float, float, float, float, float, float]]:
-        """Rank, centre, shift and width of the peak of each patch, from row and column `first`."""
+    ) -> Iterator[tuple[float, float, float, float, float, float, float]]:
+        """Rank, height further along the peak, centre, shift and width of the peak of each patch,
+        from row and column `first`.
+        """
         reach = self.reach
         for top, left, side, score in self.scored(fields, target, both, across, reach, first):
             x, y = summit(score)
             yield (
                 self._rank(score),
+                _along(score),
                 left + (side - 1) / 2,
                 top + (side - 1) / 2,
                 reach - x,
@@ -190,21 +204,34 @@ def summit(score: NDArray[np.float32]) -> tuple[float, float]:
 
 _BESIDE = 3
 """Distance in px from a peak at which its height measures its width."""
+_ALONG = ((0, 4), (4, 0), (3, 3), (3, -3))
+"""Rows and columns from a peak at which its height tells whether it is a ridge."""
 
 
 def _width(score: NDArray[np.float32]) -> float:
     """Height of the correlation beside its peak as a share of that at the peak, both above the
     median.
     """
+    across, along = _beside(score, ((0, _BESIDE), (_BESIDE, 0)))
+    return (across + along) / 2
+
+
+def _along(score: NDArray[np.float32]) -> float:
+    """The same on the line through the peak on which it is highest."""
+    return max(_beside(score, _ALONG))
+
+
+def _beside(score: NDArray[np.float32], steps: Sequence[tuple[int, int]]) -> list[float]:
+    """Mean height of the correlation on both sides of its peak, as a share of that at the peak."""
+    most = max(max(abs(y), abs(x)) for y, x in steps)
     row, column = (
-        int(np.clip(at, _BESIDE, size - 1 - _BESIDE))
+        int(np.clip(at, most, size - 1 - most))
         for at, size in zip(divmod(int(score.argmax()), score.shape[1]), score.shape, strict=True)
     )
     ground = float(np.median(score))
-    peak = float(score[row, column]) - ground
-    rows = score[[row - _BESIDE, row + _BESIDE], column]
-    columns = score[row, [column - _BESIDE, column + _BESIDE]]
-    return (float(rows.mean() + columns.mean()) / 2 - ground) / max(peak, 1e-6)
+    peak = max(float(score[row, column]) - ground, 1e-6)
+    sides = [float(score[row + y, column + x] + score[row - y, column - x]) / 2 for y, x in steps]
+    return [(side - ground) / peak for side in sides]
 
 
 def _between(three: NDArray[np.float32]) -> float:

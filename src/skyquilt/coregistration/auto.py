@@ -54,7 +54,7 @@ class Auto:
     """Agreement above which nothing else is tried."""
     beyond: bool = True
     """Whether everything is searched where a guess is not confirmed."""
-    version: ClassVar[int] = 5
+    version: ClassVar[int] = 6
 
     def __call__(self, a: Picture, b: Picture, guess: Guess | None = None) -> Outcome:
         """The registration of b to a, or the reason why there is none.
@@ -63,7 +63,7 @@ class Auto:
         metadata may be wrong.
         """
         if guess is not None:
-            found = self._guided(a, b, guess)
+            found = self._guided(a, b, guess, told=True)
             if found or not self.beyond:
                 return found
         pictures = both_usable(a, b)
@@ -81,8 +81,10 @@ class Auto:
             return found
         return self._in_part(a, b, pictures) or found
 
-    def _guided(self, a: Picture, b: Picture, guess: Guess) -> Outcome:
-        """The decision in the neighbourhood of a guess, on the part that both images then share."""
+    def _guided(self, a: Picture, b: Picture, guess: Guess, *, told: bool = False) -> Outcome:
+        """The decision in the neighbourhood of a guess, on the part that both images then share;
+        `told`: it is known beforehand.
+        """
         part = common_part(a, b, guess)
         pictures = both_usable(part.a, part.b)
         if isinstance(pictures, RefusedRegistration):
@@ -90,7 +92,7 @@ class Auto:
         pyramid = Pyramid(a=pictures[0], b=pictures[1], sides=self.sides)
         fits = self._best(pyramid, self._near(pyramid, part.guess))
         reach = part.guess.reach * max(pyramid.at(_DECIDE)[1].shape)
-        return part.whole(self.decide(pyramid, fits, reach))
+        return part.whole(self.decide(pyramid, fits, reach, told=told))
 
     def _in_part(self, a: Picture, b: Picture, pictures: tuple[Usable, Usable]) -> Outcome:
         """The decision where one image shows a part of the other only, of an eighth to a half of

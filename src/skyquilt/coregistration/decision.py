@@ -45,6 +45,10 @@ class Decide:
     """Agreement below which a registration is refused; docs/methods.md gives the values that occur
     by chance.
     """
+    least_beside: float = 2.0
+    """The same without patches along straight edges: 1.4 to 1.7 of pairs of other places with roads
+    or fields at right angles that were accepted, 2.5 and more of right registrations.
+    """
     repeats: Repeats = field(default_factory=Repeats)
     """The comparison with places further away."""
     bent: Bending = field(default_factory=Bending)
@@ -67,13 +71,19 @@ class Decide:
     """Weight of finer structure, the rest is that of coarser one. Alone it is the more exact where
     the bands are alike, and the less exact where they are not, and its error is less certain.
     """
-    version: ClassVar[int] = 6
+    version: ClassVar[int] = 7
 
     def __call__(
-        self, pyramid: Pyramid, fits: Sequence[Fit], reach: float = float("inf")
+        self,
+        pyramid: Pyramid,
+        fits: Sequence[Fit],
+        reach: float = float("inf"),
+        *,
+        told: bool = False,
     ) -> Outcome:
         """The decision on transforms in px of the finest level; `reach`: how far in px of it the
-        registration may lie from them, by what is known beforehand.
+        registration may lie from them; `told`: by what is known beforehand, so that straight edges
+        do not lie on each other because such a place was searched for.
         """
         judged = [(self.agree(*pyramid.at(pyramid.last), fit.b_H_a), fit) for fit in fits]
         if not judged:
@@ -83,6 +93,8 @@ class Decide:
         agreement, fit = max(judged, key=lambda j: j[0].surprise)
         if agreement.surprise < self.least_surprise:
             return _refused(_doubt(agreement, self.least_surprise), agreement, fit)
+        if not told and agreement.beside_edges < self.least_beside:
+            return _refused(_straight(agreement, self.least_beside), agreement, fit)
         rival = self.repeats(*pyramid.at(pyramid.last), fit.b_H_a, self.agree)
         if rival is not None and np.hypot(*rival.shift) <= reach:
             return _refused(_repeated(rival, pyramid), agreement, fit)
@@ -182,6 +194,14 @@ def _doubt(agreement: Agreement, least: float) -> str:
         f"the best position found is not confirmed: {len(agreement.px)} of {agreement.patches}"
         " patches agree with"
         f" it, significance 10^-{agreement.surprise:.1f}; 10^-{least:g} is required"
+    )
+
+
+def _straight(agreement: Agreement, least: float) -> str:
+    return (
+        "only straight edges (roads, borders of fields) lie on each other, as they do in pictures"
+        f" of other places, too; beside them the significance is 10^-{agreement.beside_edges:.1f},"
+        f" and 10^-{least:g} is required"
     )
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skyquilt.coregistration.agreement import Agree
 from skyquilt.coregistration.orientation import Orientation, at_all_shifts, own_radius, warped
@@ -52,8 +53,8 @@ class Repeats:
     most: int = 3
     """Other places that are tried."""
     fewest: int = 4
-    """Patches that both places must have in common."""
-    version: ClassVar[int] = 1
+    """Patches that both places must have in common, or each of them."""
+    version: ClassVar[int] = 2
 
     def __call__(self, a: Orientation, b: Orientation, b_H_a: Matrix, agree: Agree) -> Rival | None:
         """The strongest rival of a transform in px of this resolution; None if there is none."""
@@ -90,12 +91,22 @@ class Repeats:
             z[np.ix_((y + around) % shape[0], (x + around) % shape[1])] = 0
 
     def _lead(self, here: Correlations, there: Correlations) -> float | None:
-        """None if too few patches are covered at both places."""
+        """From patches that are covered at both places, or, where these are too few, as where one
+        picture shows a part of the other, from all of either; None where these are, too.
+        """
         difference = np.array([here[at] - there[at] for at in here if at in there])
-        if len(difference) < self.fewest:
+        if len(difference) >= self.fewest:
+            return float(difference.mean()) / max(_error(difference), 1e-9)
+        if min(len(here), len(there)) < self.fewest:
             return None
-        error = float(difference.std(ddof=1)) / np.sqrt(len(difference))
-        return float(difference.mean() / max(error, 1e-9))
+        own, other = np.array(list(here.values())), np.array(list(there.values()))
+        error = float(np.hypot(_error(own), _error(other)))
+        return float(own.mean() - other.mean()) / max(error, 1e-9)
+
+
+def _error(values: NDArray[np.float64]) -> float:
+    """Standard error of the mean of n values."""
+    return float(values.std(ddof=1) / np.sqrt(len(values)))
 
 
 def _own(shape: tuple[int, int], agree: Agree) -> int:

@@ -14,6 +14,7 @@ from skyquilt.model.camera import ADJUSTABLE, Camera
 from skyquilt.model.photo import Focal
 from skyquilt.outside import plain
 from skyquilt.photos import tags as tag
+from skyquilt.photos.guesses import guessed_focal
 from skyquilt.photos.tags import Exif, Xmp
 
 
@@ -79,11 +80,6 @@ _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _PLAUSIBLE = (0.2, 60.0)
 """A focal length outside these multiples of the long side is an error, not a lens."""
-_GUESSED, _GUESSED_THERMAL = (0.75, 0.25), (1.15, 0.30)
-"""Focal length of an unknown camera as a multiple of the long side (thermal: of the width), and its
-relative deviation: half of the table's visible cameras lie below 0.71, nine in ten from 0.58 to
-1.14.
-"""
 _MOST_ZOOM = 16.0
 _APART = 1.2
 """Focal lengths that differ by more than this factor contradict each other; 35 mm values are
@@ -132,9 +128,7 @@ def find_focal(
     for found in candidates:
         if found and _PLAUSIBLE[0] * long <= found.px <= _PLAUSIBLE[1] * long:
             return found
-    multiple, share = _GUESSED_THERMAL if thermal else _GUESSED
-    px = multiple * (width if thermal else long)
-    return Focal(px=px, sigma_px=share * px, source="guess")
+    return guessed_focal(width, height, thermal=thermal)
 
 
 def digital_zoom(exif: Exif) -> float:

@@ -269,7 +269,7 @@ def _lens(header: Header, width: int, height: int, *, thermal: bool) -> _Lens:
     exif = header.exif
     scale, note = native_scale(exif, width, height)
     sensor = find_sensor(model=exif.text(tag.MODEL), long_side=round(max(width, height) / scale))
-    thermal = thermal or (sensor is not None and sensor.band == "thermal") or _is_lwir(header)
+    thermal = thermal or (sensor is not None and sensor.band == "thermal") or _says_thermal(header)
     found = read_calibration(
         exif=exif, xmp=header.xmp, sensor=sensor, width=width, height=height, scale=scale
     )
@@ -309,7 +309,7 @@ def _thermal_frame(path: Path, header: Header, said: str | None) -> ThermalFrame
     sensor = find_sensor(
         model=header.exif.text(tag.MODEL), long_side=max(header.width, header.height)
     )
-    known = said is not None or bool(stored) or _is_lwir(header)
+    known = said is not None or bool(stored) or _says_thermal(header)
     known = known or (sensor is not None and sensor.band == "thermal")
     if not known and (not header.stored.startswith("float") or tag.band_name(header.xmp)):
         return None
@@ -337,12 +337,14 @@ def _stated(header: Header) -> Stored:
     return told or ("kelvin" if linear else "")
 
 
-def _is_lwir(header: Header) -> bool:
-    """Whether the file says that it shows a long-wave band; FLIR's rigs say it of their visible
-    pictures, too.
+def _says_thermal(header: Header) -> bool:
+    """Whether the file says that it shows a long-wave band, or that DJI's infrared camera took it;
+    FLIR's rigs say it of their visible pictures, too.
     """
     large = header.channels > 1 and max(header.width, header.height) > _LARGEST_THERMAL
-    return not large and "lwir" in header.xmp.text("Camera:BandName", "FLIR:BandName").lower()
+    told = header.xmp.text("Camera:BandName", "FLIR:BandName").lower()
+    infrared = header.xmp.text("ImageSource").lower() == "infraredcamera"
+    return not large and ("lwir" in told or infrared)
 
 
 def _camera_key(header: Header, width: int, height: int) -> str:

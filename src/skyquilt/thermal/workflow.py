@@ -34,6 +34,7 @@ from skyquilt.model.event import Event, Note, Result, StageFinished, StageStarte
 from skyquilt.model.photo import RejectedPhoto, Survey
 from skyquilt.model.registration import RefusedRegistration, Registration
 from skyquilt.ortho.radiometry import recorded_tags, value_figures
+from skyquilt.photos.guesses import as_thermal
 from skyquilt.photos.together import taken_together
 from skyquilt.settings import DEFAULTS, MosaicSettings, PictureSettings
 from skyquilt.thermal.by_heights import finer
@@ -104,8 +105,11 @@ def iter_thermal(
         heated = heated.changed(thermal_unit=None)  # it would be called idle
     refuse_apart(given.survey.photos, heats.survey.photos)
     if not any(p.band == "thermal" for p in heats.survey.photos):
+        taken = tuple(map(as_thermal, heats.survey.photos))
+        heats = replace(heats, survey=replace(heats.survey, photos=taken))
         yield Note(
-            text=f"no photo in {thermal} is known to be thermal; they are mapped unchanged",
+            text=f"no file in {thermal} says that it is thermal; all are taken for pictures of a"
+            " thermal camera, whose colours or greys show where it is warmer, not how warm",
             warning=True,
         )
     key = _key((given, settings), (heats, heated), route)
