@@ -260,7 +260,9 @@ def find_spots(
         if not here.any():  # no ground is shown by three photos
             continue
         spot = _spots(samples.place[here], darker[here], size)
-        spot = _on_other_ground(spot, [apart[k] for k in np.flatnonzero(own)], size, flat)
+        spot = _on_other_ground(
+            spot, [v for v, mine in zip(apart, own, strict=True) if mine], size, flat
+        )
         if spot.any():
             mark = around(np.kron(spot, np.ones((FINER, FINER))) > 0, size)
             found |= {v.photo: mark for v in views if alignment.camera_of[v.photo] == name}
