@@ -93,14 +93,14 @@ def test_a_later_first_octave_leaves_out_small_features_and_moves_none(octave):
     assert later.size.min() > 1.5 ** (octave + 1) * usual.size.min()
 
 
-@pytest.mark.parametrize(("longest", "more"), [(256, 3.0), (255, 1.0)])
-def test_small_pictures_are_enlarged_and_show_as_many_more_features(longest, more):
+@pytest.mark.parametrize(("doubled", "more"), [(128, 3.0), (127, 1.0)])
+def test_small_pictures_are_enlarged_and_show_as_many_more_features(doubled, more):
     """Of a picture of 128 px, doubled, the keypoints are where they are in its own pixels."""
     small, rng = texture(104, 134, seed=5), np.random.default_rng(2)
     views = small[4:100, 3:131], small[:96, :128]  # the same ground 3 px to the left, 4 px up
     noisy = [np.clip(v + rng.normal(0, 1, v.shape), 0, 255).astype(np.uint8) for v in views]
-    a, b = (Sift(longest=longest)(v) for v in noisy)
-    usual = Sift(longest=128)(noisy[0])
+    a, b = (Sift(doubled=doubled)(v) for v in noisy)
+    usual = Sift(doubled=0)(noisy[0])
     assert (len(a) > more * len(usual)) == (more > 1) and (a.scale == 0.5) == (more > 1)
     matches = Mutual()(a, b)
     off = b.px[matches.index_b] - a.px[matches.index_a] - [3, 4]

@@ -21,8 +21,10 @@ class Sift:
     count: int = 1200
     """Most keypoints kept per photo."""
     longest: int = 512
-    """Longest side in px of the image searched. Smaller photos are searched as they are, those of
-    half of it and less enlarged: they would have a fifth of the keypoints.
+    """Longest side in px of the image searched; smaller photos are searched as they are."""
+    doubled: int = 256
+    """Longest side in px of photos that are enlarged to twice their size: those of half of 512 px
+    and less would have a fifth of the keypoints.
     """
     contrast: float = 0.015
     """OpenCV's contrast threshold."""
@@ -55,7 +57,7 @@ class Sift:
         to.
         """
         (grey,) = stretched(to_grey8(small))
-        if 2 * max(grey.shape) <= self.longest:
+        if max(grey.shape) <= self.doubled:
             grey = np.asarray(cv2.resize(grey, None, fx=2, fy=2), np.uint8)
         if self.first_octave > -1:  # OpenCV's first octave doubles whatever it is given
             part = 2 ** (self.first_octave + 1)

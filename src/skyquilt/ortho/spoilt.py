@@ -260,9 +260,8 @@ def find_spots(
         if not here.any():  # no ground is shown by three photos
             continue
         spot = _spots(samples.place[here], darker[here], size)
-        spot = _on_other_ground(
-            spot, [v for v, mine in zip(apart, own, strict=True) if mine], size, flat
-        )
+        mine = [v for v, is_own in zip(apart, own, strict=True) if is_own]
+        spot = _on_other_ground(spot, mine, size, flat)
         if spot.any():
             mark = around(np.kron(spot, np.ones((FINER, FINER))) > 0, size)
             found |= {v.photo: mark for v in views if alignment.camera_of[v.photo] == name}
