@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.oblique_start import reach_of
 from skyquilt.imaging.blank import Blank, around, joined
 from skyquilt.imaging.nodes import View, project_all
 from skyquilt.imaging.views import make_views, native_gsd, on_ground
@@ -355,15 +356,10 @@ def _on_other_ground(
         box = np.array([[columns.min(), rows.min()], [columns.max() + 1, rows.max() + 1]])
         px = box * np.array(size) / spot.shape[::-1] - 0.5
         ground = np.array([on_ground(v, px, flat)[:, :2].mean(0) for v in views])
-        sky = ~np.isfinite(ground).all(1)
-        if not sky.all() and _extent(ground[~sky]) >= MOVES * _extent(centres[~sky]):
+        seen = np.isfinite(ground).all(1)  # not the sky
+        if reach_of(ground) >= MOVES * reach_of(centres[seen]):
             kept |= part == k
     return kept
-
-
-def _extent(places: NDArray[np.float64]) -> float:
-    """Median distance of places (n, 2) from their middle."""
-    return float(np.median(np.linalg.norm(places - places.mean(0), axis=1)))
 
 
 def _shares(place: NDArray[Any], size: tuple[int, int]) -> NDArray[np.float64]:
