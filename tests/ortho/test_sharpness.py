@@ -59,9 +59,10 @@ def seen(alignment, seed=1):
     return out
 
 
-def found(alignment, details):
+def found(alignment, details, apart=None):
     names = [f"{k}.jpg" for k in range(len(details))]
-    return find_blurred(alignment, lambda k: details[k].astype(np.float32), names)
+    apart = set(alignment.poses) if apart is None else apart
+    return find_blurred(alignment, lambda k: details[k].astype(np.float32), names, apart)
 
 
 def test_sharp_photos_of_changing_ground_are_all_kept():
@@ -117,6 +118,19 @@ def test_a_spot_on_the_lens_is_found_and_only_there():
     expected = np.zeros((ROWS, COLUMNS), bool)
     expected[4:6, 7:9] = True
     assert np.array_equal(spot, expected)
+
+
+def test_photos_of_one_place_tell_of_the_lens_once():
+    """Brackets: three exposures at each of eight places; what six of these lack is chance."""
+    once = flight(8)
+    poses = {k: once.poses[k // 3] for k in range(24)}
+    thrice = replace(once, poses=poses, camera_of=dict.fromkeys(poses, once.camera_of[0]))
+    details = seen(thrice)
+    for k in range(18):
+        details[k][4:6, 7:9, 2] -= 2.0
+    marks, _ = found(thrice, details)
+    assert len(marks) == 24
+    assert found(thrice, details, apart=range(0, 24, 3)) == ({}, ())
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ every picture. How sharp a picture is depends on what it shows: water has no det
 pictures are compared where they show the same ground.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,10 +55,14 @@ AT_ONCE = 50_000
 
 
 def find_blurred(
-    alignment: Alignment, details: Callable[[int], NDArray[np.float32]], names: Sequence[str]
+    alignment: Alignment,
+    details: Callable[[int], NDArray[np.float32]],
+    names: Sequence[str],
+    apart: Collection[int],
 ) -> tuple[dict[int, Blank], tuple[str, ...]]:
     """What is blurred, by photo, only of photos where something is, and notes. `details`: detail
-    (rows, columns, 2) in the cells of a photo (index); `names` of the photos.
+    (rows, columns, 3) in the cells of a photo (index); `names` of the photos; `apart`: photos
+    (indices) taken at places apart, which tell spots of the lens.
     """
     photos = sorted(alignment.poses)
     if len(photos) < FEWEST_PHOTOS:
@@ -87,8 +91,8 @@ def find_blurred(
         found |= {photos[k]: whole_picture(size) for k in blurred}
         if len(blurred):
             notes.append(blurred_note([names[photos[k]] for k in blurred]))
-        sharp = np.setdiff1d(own, blurred)
-        spot = _spot(off[sharp, ..., 2] - each[sharp, None, None, 2])
+        told_by = np.array([k for k in np.setdiff1d(own, blurred) if photos[k] in apart], np.int64)
+        spot = _spot(off[told_by, ..., 2] - each[told_by, None, None, 2])
         if spot.any():
             room = np.kron(np.where(spot, -1, 1), np.ones((FINER, FINER))).astype(np.float32)
             mark = Blank(room=room, size=size)

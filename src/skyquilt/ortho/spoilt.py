@@ -84,7 +84,10 @@ def spoilt_parts(
     `heat`: thermal photos, in which white is warm, and contrast that of a palette: neither tells
     overexposure, smoke or fog.
     """
-    blurred, notes = find_blurred(alignment, details, names)
+    flat = level(alignment.ground_m)
+    placed = make_views(alignment, flat)
+    apart = _apart(alignment, placed, flat)
+    blurred, notes = find_blurred(alignment, details, names, {v.photo for v in apart})
     white, of_8_bits = dict[int, Blank](), set[int]()
     for i in sorted(alignment.poses):
         camera, thumbnail = alignment.camera(i), thumbnails[i]
@@ -95,10 +98,7 @@ def spoilt_parts(
     if white:
         notes += (overexposed_note([names[i] for i in white]),)
     xyz = alignment.ties.xyz
-    flat = level(alignment.ground_m)
-    placed = make_views(alignment, flat)
-    views = [v for v in placed if v.photo in of_8_bits]
-    apart = _apart(alignment, views, flat)
+    views, apart = ([v for v in some if v.photo in of_8_bits] for some in (placed, apart))
     cameras = [alignment.camera_of[v.photo] for v in apart]
     written, told = find_lasting_marks(apart, cameras, thumbnails, flat, fixed)
     marks = {v.photo: written[c] for v in views if (c := alignment.camera_of[v.photo]) in written}
