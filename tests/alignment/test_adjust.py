@@ -251,7 +251,8 @@ def test_an_error_that_all_tilts_share_moves_the_block_as_its_covariance_says():
     problem, turned = block.problem, (block.problem.camera == 1)[:, None, None]
     first = adjust(problem, block.start, tolerance=1e-12).state
     alone = covariance(problem, first)
-    told = with_common_tilts(alone, problem, first)
+    stated = problem.sigma_R[:, 0]
+    told = with_common_tilts(alone, problem, first, stated)
     for axis, by in enumerate(rotation_from_vector(np.radians(1.0) * np.eye(3)[:2])):
         R0 = np.where(turned, by @ problem.R0, problem.R0)
         moved = adjust(replace(problem, R0=R0), first, tolerance=1e-12).state

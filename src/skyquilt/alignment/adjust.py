@@ -191,14 +191,15 @@ def covariance(problem: Problem, state: State) -> Covariance | None:
     return Covariance(photos=photos, cameras=cameras, inverse=inverse, factor=factor, common=none)
 
 
-def with_common_tilts(found: Covariance, problem: Problem, state: State) -> Covariance:
-    """The covariance where tilts that were measured err by their deviations not only each by itself
-    but also all of a camera alike, as seen from it, as a gimbal does. No number of photos averages
-    that out.
+def with_common_tilts(
+    found: Covariance, problem: Problem, state: State, alike: Array
+) -> Covariance:
+    """The covariance where tilts that were measured err not only each by itself but also all of a
+    camera alike, as seen from it, as a gimbal does, by these deviations (n,) in rad. No number of
+    photos averages that out.
     """
     first = problem.photo_unknowns * np.arange(len(state.C))
-    tilt = np.where(np.isfinite(problem.sigma_R), problem.sigma_R, 0.0)[:, :1]
-    known = attitude_terms(problem, state)[1] * tilt
+    known = attitude_terms(problem, state)[1] * alike[:, None]
     pull = np.zeros((found.factor.total, 2 * len(state.K)))
     for axis in range(2):  # an error about x, and one about y of a camera
         turned = np.einsum("nij,nj->ni", problem.R0, known * problem.R0[:, axis])

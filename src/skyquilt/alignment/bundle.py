@@ -12,6 +12,7 @@ from skyquilt.alignment.determined import weak_photos
 from skyquilt.alignment.dominant_plane import levelled
 from skyquilt.alignment.enlarged import as_enlarged
 from skyquilt.alignment.equations import NearFactor
+from skyquilt.alignment.false_tilts import alike_off
 from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
 from skyquilt.alignment.motion import speeds_of
 from skyquilt.alignment.near_positions import told_besides
@@ -22,15 +23,9 @@ from skyquilt.alignment.outcome import accuracy, ground_points, leave_one_out, m
 from skyquilt.alignment.problem import Problem, State
 from skyquilt.alignment.repairs import Beginning, Survey, Tried, begun_with, repaired
 from skyquilt.alignment.setup import Setup, camera_records, pose_records, priors_by_camera, set_up
-from skyquilt.alignment.stages import (
-    believe_positions,
-    fine_steps,
-    plain,
-    rough_steps,
-    settled,
-    weighed,
-)
+from skyquilt.alignment.stages import fine_steps, plain, rough_steps, settled, weighed
 from skyquilt.alignment.start import Start, find_start, focals_by_heights, ground_of, with_focals
+from skyquilt.alignment.told_poses import believe_told
 from skyquilt.alignment.tracks import Thinning, Tracks, build_tracks, thin
 from skyquilt.alignment.triangulate import triangulated
 from skyquilt.alignment.unfit_cameras import (
@@ -80,7 +75,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 72
+    version: ClassVar[int] = 73
 
     def __call__(
         self,
@@ -256,7 +251,7 @@ class Bundle:
         if self.repair:
             problem, state = settled(problem, state, setup)
             part = keep.within("positions")
-            problem, state = believe_positions(problem, state, setup, part, near)
+            problem, state = believe_told(problem, state, setup, part, near)
             problem, state = settled(problem, state, setup)
         del step, near
         problem, state, frame, reports = hold_to_control(problem, state, frame, setup, control)
@@ -343,7 +338,8 @@ def _outcome(
     if all(c.check for c in control):
         weak |= _nowhere(start)
     alone = covariance(problem, state)
-    full = alone and with_common_tilts(alone, problem, state)
+    alike = alike_off(problem, state, setup.block_rows)
+    full = alone and with_common_tilts(alone, problem, state, alike)
     cameras, camera_of = camera_records(
         photos, setup, state, None if full is None else full.camera_sigmas
     )

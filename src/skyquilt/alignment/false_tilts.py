@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.determined import STATED_DEG
 from skyquilt.alignment.priors import empty_prior
+from skyquilt.alignment.problem import Problem, State
 from skyquilt.alignment.setup import HALF_TURN, TURNED
 from skyquilt.geometry.frames import (
     angles_from_cam_R_map,
@@ -54,6 +55,8 @@ LEAST_ON_LINE, LEAST_LINES = 3, 2
 """Photos on a line, and lines, whose heights tell a gimbal from a drift."""
 LINE_DEG = 60.0
 """Photos that follow one another in directions less apart belong to a line."""
+SURELY = 2.0
+"""Deviations of a slope that heights tell, up to which it is taken for chance."""
 LEAST_NOISE = 0.1
 """Heights that photos report are not better than this share of their deviations."""
 ROUNDS = 12
@@ -161,6 +164,29 @@ def leaning_lines(
             corrected[i] = replace(priors[i], pitch_deg=priors[i].pitch_deg - off)
         said.append(COMMON_NOTE.format(name, abs(off)))
     return (corrected if said else priors), tuple(said)
+
+
+def alike_off(problem: Problem, state: State, blocks: Sequence[NDArray[np.int64]]) -> Array:
+    """Deviation (n,) in rad by which tilts that a camera's photos tell may all be off alike: the
+    one that they state, and the slope by which heights told contradict those found in their block
+    (rows), less what chance makes of it. Which of the two is wrong, a gimbal or a drifting height,
+    nothing tells where photos are all headed alike.
+    """
+    stated = np.where(np.isfinite(problem.sigma_R), problem.sigma_R, 0.0)[:, 0]
+    slope = np.zeros(len(stated))
+    for rows in blocks:
+        known = rows[np.isfinite(problem.C0[rows]).all(1)]
+        if len(known) < FEWEST:
+            continue
+        away = state.C[known] - state.C[known].mean(0)
+        plane = np.column_stack([away[:, :2], np.ones(len(known))])
+        high = problem.C0[known, 2] - state.C[known, 2]
+        least = LEAST_NOISE * float(np.median(problem.sigma_C[known, 2]))
+        fit = _fitted(_Group(plane[:, None], high[:, None], least))
+        variance, axes = np.linalg.eigh(fit.covariance[:2, :2])
+        along = np.abs(axes.T @ fit.x[:2]) - SURELY * np.sqrt(variance)
+        slope[rows] = np.arctan(np.linalg.norm(np.maximum(along, 0.0)))
+    return np.hypot(stated, slope)
 
 
 def _stated_by(camera: str, priors: Sequence[Prior], cameras: Sequence[str]) -> list[int]:

@@ -1,5 +1,5 @@
-"""The stages of an adjustment: ever narrower losses, outliers removed in between, observations and
-positions believed as far as they show to be right.
+"""The stages of an adjustment: ever narrower losses, outliers removed in between, observations
+believed as far as they show to be right.
 """
 
 from collections.abc import Callable
@@ -11,13 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.adjust import adjust
-from skyquilt.alignment.deviations import (
-    believed,
-    lone_errors,
-    observed_noise,
-    position_noise,
-    robust_scale,
-)
+from skyquilt.alignment.deviations import believed, observed_noise, robust_scale
 from skyquilt.alignment.equations import NearFactor
 from skyquilt.alignment.problem import (
     READOUT,
@@ -57,13 +51,6 @@ logarithm.
 """
 LEAST_NOISE = 0.02
 """Share of the variance that positions state, at least, as which their scatter is taken."""
-DOUBTED = 2.5
-"""Positions that a block misses by more than this many deviations are not what they claim."""
-
-CONFIRMED = 1.4
-"""A scatter of positions up to so many times what they state confirms it: the scatter of some
-twenty photos is itself known to a fifth.
-"""
 
 
 Step = Callable[[Problem, State], tuple[Problem, State]]
@@ -286,59 +273,6 @@ def prune(problem: Problem, state: State, limit: float) -> tuple[Problem, State]
     good &= enough[problem.point] | pinned[problem.point]
     thinner, points = problem.only(good)
     return thinner, replace(state, X=state.X[points])
-
-
-def believe_positions(
-    problem: Problem,
-    state: State,
-    setup: Setup,
-    keep: Keep = MADE_NOW,
-    near: NearFactor | None = None,
-) -> tuple[Problem, State]:
-    """Positions believed as far as the photos confirm them.
-
-    The start gave them deviations as wide as their scatter about it, which is coarse. Here they get
-    those that they state, or their scatter between neighbours where that is clearly larger; single
-    ones that are grossly wrong get their error, since together they would shrink the block. Only
-    differences from photo to photo count: a smooth misfit may be a deformation of the block, and
-    positions with less weight would permit it. Where a block then still misses its positions by
-    more than these deviations allow, they are not what they claim (a drifting barometer, a plain
-    GPS that states centimetres), and what the start gave stays.
-    """
-    started = problem.sigma_C
-    doubted, near = np.zeros(started.shape, bool), near or NearFactor()
-    for again in range(3):
-        error = state.C - problem.C0
-        sigma, single = started.copy(), False
-        for block in setup.block_rows:
-            for axes in (slice(0, 2), slice(2, 3)):
-                stated = setup.stated_sigma_C[block][:, axes]
-                own = error[block][:, axes]
-                lone = np.zeros(len(own), bool)
-                if not setup.in_space:  # there a photo may be alone in a false minimum
-                    lone = lone_errors(own, float(np.median(stated)))
-                noise = position_noise(own[~lone])
-                wanted = np.maximum(stated, noise if (noise > CONFIRMED * stated).any() else 0.0)
-                trusted = ~doubted[block][:, axes]
-                given = np.where(trusted, wanted, sigma[block, axes])
-                single |= bool(lone.any())
-                off = np.linalg.norm(own, axis=1, keepdims=True)
-                sigma[block, axes] = np.where(lone[:, None], off, given)
-        alike = np.allclose(sigma, problem.sigma_C, rtol=0.15, equal_nan=True)
-        problem = replace(problem, sigma_C=sigma)
-        if alike:
-            break
-        if single:  # gone is what drew the block aside
-            problem, state = settled(problem, state, setup, clearly=0.0)
-        narrow, part = problem.with_loss(2.0), keep.within(str(again))
-        state = adjust(narrow, state, iterations=10, tolerance=1e-4, keep=part, near=near).state
-        misfit = np.abs(state.C - problem.C0) / problem.sigma_C
-        for block in setup.block_rows:
-            for axes in (slice(0, 2), slice(2, 3)):
-                known = misfit[block][:, axes][np.isfinite(misfit[block][:, axes])]
-                if len(known) and 1.48 * np.median(known) > DOUBTED:
-                    doubted[block, axes] = True
-    return problem, state
 
 
 def settled(
