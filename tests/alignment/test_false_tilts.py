@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from skyquilt.alignment import false_tilts, repairs
+from skyquilt.alignment import false_tilts, repairs, told_poses
 from skyquilt.alignment.false_tilts import common_tilts, leaning_lines, told_no_tilt
 from skyquilt.alignment.setup import HALF_TURN, TURNED
 from skyquilt.geometry.frames import cam_R_map_from_angles, rotation_from_vector
@@ -26,19 +26,20 @@ def off(found, flown):
 @pytest.mark.parametrize("seed", [0, 2, 3])
 def test_a_fixed_camera_that_claims_to_look_straight_down(seed, monkeypatch):
     """The aircraft leans by 8 degrees; files say 0, as exactly as those of a gimbal do. What is
-    found then is what is found where files do not tell.
+    found then is as good as what is found where files do not tell.
     """
     flown = Flown(seed, lines=4, per_line=6, points=900, true_tilt_deg=8.0)
     flown.priors = [replace(p, pitch_deg=0.0, roll_deg=0.0) for p in flown.priors]
     found = flown.aligned()
     assert sum("tilts of the camera contradict" in n for n in found.notes) == 1
     monkeypatch.setattr(repairs, "told_no_tilt", lambda found, priors: (priors, ""))
+    monkeypatch.setattr(told_poses, "_scattered_tilts", lambda problem, *_: problem.sigma_R)
     believing = flown.aligned()
     flown.priors = [replace(p, sigma_tilt_deg=8.0) for p in flown.priors]
     untold = flown.aligned()
     errors = [np.median(off(f, flown)) for f in (found, believing, untold)]
     assert errors[0] < 0.8 * errors[1]
-    assert errors[0] == pytest.approx(errors[2], abs=0.1)
+    assert errors[0] < errors[2] + 0.1
 
 
 @pytest.mark.parametrize(

@@ -318,11 +318,16 @@ def _leaning_lines(last: Tried, survey: Survey) -> Tried:
 
 
 def _false_tilts(last: Tried, survey: Survey) -> Tried:
-    """Tilts that pictures contradict as a whole are not used."""
-    if slanting(last.begun.priors):
-        return last
+    """Tilts that pictures contradict as a whole are not used, or count for little already, since
+    they scatter.
+    """
     loose, note = told_no_tilt(last.found, last.begun.priors)
-    return _if_nearer(last, survey, loose, "loose ", note) if note else last
+    if slanting(last.begun.priors) or not note:
+        return last
+    other = survey.tried(last.begun, priors=loose, name="loose ")
+    off, before = (off_positions(t.found, loose) for t in (other, last))
+    best = other if off < before else last
+    return replace(best, notes=(*last.notes, note)) if MORE_ALIKE * off < before else last
 
 
 def _guessed_directions(last: Tried, survey: Survey) -> Tried:
