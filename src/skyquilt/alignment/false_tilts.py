@@ -35,8 +35,8 @@ MOST_DEG = 20.0
 """Largest deviation from the vertical that such photos are given."""
 NOTE = (
     "The reported tilts of the camera contradict the pictures: half of the photos look more than"
-    " {0:.0f} degrees away from where they say (a camera that is fixed to its aircraft?). They count"
-    " for little."
+    " {0:.0f} degrees away from where they say (a camera that is fixed to its aircraft?). They"
+    " count for little."
 )
 COMMON_DEG = 1.5
 """Smaller errors that photos of a camera have in common are usual: lines there and back bear them.
