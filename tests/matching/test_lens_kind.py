@@ -7,7 +7,7 @@ import pytest
 
 from skyquilt.geometry.camera import pixels, project, rays
 from skyquilt.geometry.frames import cam_R_map_from_angles
-from skyquilt.matching.lens_kind import as_fisheye, as_pinhole, fisheyes, may_be_fisheye
+from skyquilt.matching.lens_kind import FEWEST, as_fisheye, as_pinhole, fisheyes, may_be_fisheye
 from skyquilt.matching.verify import Verify
 from skyquilt.model.camera import Camera
 from skyquilt.model.features import Features, Link, Matches
@@ -20,12 +20,13 @@ def lens(focal, *, fisheye, k1=0.0):
     return replace(ideal, fisheye=float(fisheye), k1=k1)
 
 
-def survey(camera, *, relief, count=4, noise=0.3, seed=5):
+def survey(camera, *, relief, count=4, noise=0.3, seed=5, hill=0.0, points=6000):
     """Features of photos of one line, 30 % of the height apart, and all pairs of neighbours with
-    their true matches and some false ones.
+    their true matches and some false ones; above the top of a hill where it has a height.
     """
     rng = np.random.default_rng(seed)
-    xyz = np.column_stack([rng.uniform(-90, 150, (6000, 2)), rng.uniform(0, relief, 6000)])
+    xyz = np.column_stack([rng.uniform(-90, 150, (points, 2)), rng.uniform(0, relief, points)])
+    xyz[:, 2] += hill * (np.exp(-(np.hypot(xyz[:, 0] - 18, xyz[:, 1]) ** 2) / 100**2) - 1)
     seen = []
     for n in range(count):
         R = cam_R_map_from_angles(*rng.normal(0, 2, 3))
@@ -86,6 +87,15 @@ def test_a_wide_pinhole_stays_one(focal, k1, relief):
     features, matches = survey(lens(focal, fisheye=False, k1=k1), relief=relief)
     found, links = judge(focal, features, matches)
     assert links >= 2
+    assert not found
+
+
+@pytest.mark.parametrize("focal", [833.0, 930.0])
+def test_a_pinhole_stays_one_over_a_steep_hill_which_bends_pictures_as_a_fisheye_does(focal):
+    camera = lens(focal, fisheye=False)
+    features, matches = survey(camera, relief=2.0, noise=0.1, hill=80.0, points=2500)
+    found, links = judge(focal, features, matches)
+    assert links >= FEWEST
     assert not found
 
 

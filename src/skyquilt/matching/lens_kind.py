@@ -33,9 +33,10 @@ SUSPECT = 0.9
 which matches are counted; above it a lens is a pinhole's, whose ratios are above 1.
 """
 EVIDENT = 0.6
-"""The same below which nothing else is asked: 0.2 to 0.5 is usual for fisheyes, and over relief of
-a seventh of the height 0.6 to 0.8. Pinholes with as much distortion as a fisheye come below it too,
-and are no worse as fisheyes.
+"""The same below which a lens is a fisheye's unless more matches agree closely with a pinhole: 0.2
+to 0.5 is usual for fisheyes, and over relief of a seventh of the height 0.6 to 0.8. But the top of
+a steep hill bends pictures alike: pinholes of 73 and 84 degrees 100 m above one of 200 and 100 m
+have 0.52 and 0.28.
 """
 MORE = 1.06
 """So many times as many matches must agree with a fisheye: 1.04 to 1.3 times as many do for
@@ -47,10 +48,17 @@ FOCALS = (1.0, 0.8, 0.65)
 """Multiples of the reported focal length that are tried: a guess may be far off, and 35 mm
 equivalents of fisheyes are given by the field of view as well as by the focal length.
 """
+ASKED = 300
+"""Matches of a pair of which it is asked with which kind of lens they agree closely."""
 SIGMA_FOCAL = 0.2
 """Relative deviation of the focal length after that."""
 COUNTED_PX = 1.0
 """Tolerance of the matches that are counted, in px of the picture that was searched."""
+CLOSE_PX = 0.15
+"""The same for matches that agree closely. So many times as many agree with a fisheye: 1.08 to 1.28
+for fisheyes of 84 to 118 degrees, over a steep hill too, 0.82 to 0.95 for pinholes over steep hills
+or with as much distortion as a fisheye.
+"""
 TOLERANCE_PX = 2.0
 """Of matches that agree, in px of the picture that was searched for features: lenses that are taken
 for those of a kind differ from it.
@@ -125,24 +133,28 @@ def fisheyes(
         own = {i for i, camera in cameras.items() if camera == key}
         linked = [k for k in links if k.a in own and k.b in own]
         some = [linked[n] for n in _spread(len(linked))]
-        pairs = [(k.a, k.b) for k in some]
+        pairs, straighter, multiple = [(k.a, k.b) for k in some], EVIDENT, 1.0
         if len(some) < FEWEST:
             inside = [pair for pair in tried if pair[0] in own and pair[1] in own]
             pairs = [inside[n] for n in _spread(len(inside))]
         else:
             straighter, multiple = _straighter(lens, features, some)
-            if straighter < EVIDENT:
-                found[key] = as_fisheye(lens, multiple)
-            if not EVIDENT <= straighter < SUSPECT:
-                continue
-        fisheye = _judged(lens, [matched(*pair) for pair in pairs], features(min(own)).scale)
+        if straighter >= SUSPECT:
+            continue
+        px, scale = [matched(*pair) for pair in pairs], features(min(own)).scale
+        fisheye = (
+            _unless_closer(lens, multiple, px, scale)
+            if straighter < EVIDENT
+            else _judged(lens, px, scale)
+        )
         if fisheye is not None:
             found[key] = fisheye
     return found
 
 
-def _spread(count: int) -> list[int]:
-    where = np.linspace(0, count - 1, min(count, LOOKED_AT)).astype(int)
+def _spread(count: int, most: int = LOOKED_AT) -> list[int]:
+    """At most so many of `count` numbers, evenly."""
+    where = np.linspace(0, count - 1, min(count, most)).astype(int)
     return [int(n) for n in np.unique(where)]
 
 
@@ -181,20 +193,38 @@ def _stretch(camera: Camera, px: Px) -> float:
     return float(np.median(np.sqrt(np.tan(angle) / angle) / np.cos(angle)))
 
 
+def _agreeing(lens: Camera, pairs: Sequence[tuple[Px, Px]], px: float) -> tuple[list[int], int]:
+    """How many matches of pairs agree within px with a fisheye, for each of the focal lengths, and
+    with a pinhole of the one that most agree with.
+    """
+
+    def count(kind: Camera) -> int:
+        agree = (
+            agreeing(unit_rays(kind, a), unit_rays(kind, b), px / kind.focal) for a, b in pairs
+        )
+        return sum(int(mask.sum()) for mask in agree)
+
+    bent = [as_fisheye(lens, m) for m in FOCALS]
+    return [count(c) for c in bent], max(count(replace(c, fisheye=0.0)) for c in bent)
+
+
+def _unless_closer(
+    lens: Camera, multiple: float, pairs: Sequence[tuple[Px, Px]], scale: float
+) -> Camera | None:
+    """The fisheye of a multiple of the focal length, unless more matches of pairs agree closely
+    with a pinhole.
+    """
+    few = [(a[some], b[some]) for a, b in pairs for some in [_spread(len(a), ASKED)]]
+    counts, pinhole = _agreeing(lens, few, CLOSE_PX * scale)
+    return as_fisheye(lens, multiple) if max(counts) >= pinhole else None
+
+
 def _judged(lens: Camera, pairs: Sequence[tuple[Px, Px]], scale: float) -> Camera | None:
     """The fisheye with which most matches of pairs agree, if clearly more than with a pinhole of
     any of the same focal lengths.
     """
-
-    def count(kind: Camera) -> int:
-        rad = COUNTED_PX * scale / kind.focal
-        agree = (agreeing(unit_rays(kind, a), unit_rays(kind, b), rad) for a, b in pairs)
-        return sum(int(mask.sum()) for mask in agree)
-
-    bent = [as_fisheye(lens, m) for m in FOCALS]
-    counts = [count(c) for c in bent]
-    pinhole = max(count(replace(c, fisheye=0.0)) for c in bent)
+    counts, pinhole = _agreeing(lens, pairs, COUNTED_PX * scale)
     best = int(np.argmax(counts))
     if counts[best] < max(MORE * pinhole, pinhole + CERTAIN):
         return None
-    return bent[best]
+    return as_fisheye(lens, FOCALS[best])
