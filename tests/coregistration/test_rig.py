@@ -56,16 +56,16 @@ def test_too_few_and_quarrelling_pairs_are_refused():
 
 
 def late_pairs(rng, delay_s, headings, flown=(0.0, -6.0, 0.0), height=60.0):
-    """Pairs over level ground of a second camera that is exposed later, on lines flown so that the
-    first camera sees the drone go at these headings.
+    """Pairs over level ground of a second camera that is exposed later (one delay, or one of each
+    pair), on lines flown so that the first camera sees the drone go at these headings.
     """
     found = []
-    for heading in headings:
+    for heading, late_s in zip(headings, np.broadcast_to(delay_s, len(headings)), strict=True):
         velocity = cam_R_map_from_angles(heading) @ cam_R_map_from_angles(0).T @ np.array(flown)
         px_a = rng.uniform([800, 600], [3200, 2400], (30, 2))
         ray = rays(A, px_a)
         ground = ray * height / ray[:, 2:]
-        px_b = project(B, (ground - delay_s * velocity) @ TRUE.T)
+        px_b = project(B, (ground - late_s * velocity) @ TRUE.T)
         pace = velocity / np.linalg.norm(ground, axis=1, keepdims=True)
         pair = RigPair(px_a=px_a + rng.normal(0, 4, (1, 2)), px_b=px_b, camera_a=A, pace=pace)
         found.append(pair)
@@ -91,6 +91,24 @@ def test_no_delay_is_made_up(delay_s, headings):
     """Nor where a rotation explains it: cameras that turn with the lines see one way of flight."""
     rig = FindRig(free=0)(late_pairs(np.random.default_rng(8), delay_s, headings), B)
     assert rig.delay_s == 0 and rig.agreeing == 10
+
+
+def test_recorded_times_of_a_camera_with_a_clock_of_its_own_are_used_where_they_are_true():
+    """Each pair is late by another time; the camera turns with the lines. Times that were drawn
+    apart from the pictures change nothing.
+    """
+    rng = np.random.default_rng(9)
+    true, drawn = rng.uniform(-0.2, 0.2, (2, 10))
+    pairs = late_pairs(rng, 0.1 + true, [0] * 10)
+    plain, timed, astray = (
+        FindRig(free=0)(
+            [replace(p, late_s=float(s)) for p, s in zip(pairs, late_s, strict=True)], B
+        )
+        for late_s in (0 * true, true, drawn)
+    )
+    assert timed.timed and timed.spread_deg < 0.15 < 0.3 < plain.spread_deg
+    assert not plain.timed and not astray.timed
+    assert astray.spread_deg == plain.spread_deg
 
 
 def test_the_median_of_rotations_bears_outliers():

@@ -5,7 +5,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 
 from skyquilt.model.photo import Focal, GeoPosition, Photo
-from skyquilt.photos.together import taken_together
+from skyquilt.photos.together import late_by, taken_together
 
 NOON = datetime(2024, 6, 1, 12)
 
@@ -78,3 +78,13 @@ def test_of_a_wide_and_a_zoom_camera_the_wide_one_counts():
     for b in (heat, unnamed):
         assert taken_together([*near, *wide], b) == [(7, 0), (5, 1)]
         assert taken_together([*wide, *near], b) == [(3, 0), (1, 1)]
+
+
+def test_how_late_a_camera_with_a_clock_of_its_own_is_beside_its_median():
+    a = [photo(f"A_{k}.jpg", 2.0 * k + 0.125) for k in range(4)]
+    late = [0.25, 0.0, -0.125, 0.125]
+    b = [photo(f"B_{k}.jpg", 2.0 * k + 0.5 + s) for k, s in enumerate(late)]
+    assert late_by(a, b).tolist() == [s - 0.0625 for s in late]
+    whole = [photo(f"B_{k}.jpg", 2.0 * k) for k in range(4)]
+    untimed = [photo(f"B_{k}.jpg") for k in range(4)]
+    assert not late_by(a, whole).any() and not late_by(a, untimed).any()

@@ -85,6 +85,8 @@ class _Matched:
     """(n,) 1 over their depth in m."""
     velocity: Array
     """(n, 3) of the map's camera along its own axes, m/s."""
+    late_s: Array
+    """(n,) `Together.late_s`."""
     pair: NDArray[np.intp]
     """(n,) pair that each was matched in."""
     camera_a: Camera
@@ -92,10 +94,8 @@ class _Matched:
 
     def only(self, kept: NDArray[np.bool_]) -> "_Matched":
         """These (n,) of them."""
-        parts = {
-            n: getattr(self, n)[kept] for n in ("px_a", "px_b", "nearness", "velocity", "pair")
-        }
-        return replace(self, **parts)
+        names = ("px_a", "px_b", "nearness", "velocity", "late_s", "pair")
+        return replace(self, **{n: getattr(self, n)[kept] for n in names})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -287,15 +287,17 @@ class FindBandRig:
             px_b = full_px(px + shift, b.shape, full)
             px_a, near = there.in_photo(px, small, pair)
             velocity = np.broadcast_to(pair.velocity, (len(px_a), 3))
-            rows.append((px_a, px_b, near, velocity, np.full(len(px_a), k, np.intp)))
-        px_a, px_b, near, velocity, pair_ = (
-            np.concatenate([row[n] for row in rows]) for n in range(5)
+            late = np.full(len(px_a), pair.late_s)
+            rows.append((px_a, px_b, near, velocity, late, np.full(len(px_a), k, np.intp)))
+        px_a, px_b, near, velocity, late, pair_ = (
+            np.concatenate([row[n] for row in rows]) for n in range(6)
         )
         return _Matched(
             px_a=px_a,
             px_b=px_b,
             nearness=near,
             velocity=velocity,
+            late_s=late,
             pair=pair_,
             camera_a=pairs[0][1].camera_a,
         )
@@ -325,7 +327,7 @@ class FindBandRig:
 
         def misfit(x: Array) -> Array:
             # what is far off counts like what is three deviations off
-            px_b = camera(x).sees(ray_a, found.nearness, found.velocity)
+            px_b = camera(x).sees(ray_a, found.nearness, found.velocity, found.late_s)
             off = np.nan_to_num(px_b - found.px_b, nan=1e3) / sigma
             length = np.linalg.norm(off, axis=1, keepdims=True)
             weight = np.sqrt(np.log1p((length / 2) ** 2) / np.maximum((length / 2) ** 2, 1e-12))
@@ -403,5 +405,6 @@ def _shifts(a: Orientation, b: Orientation, reach: int, apart: float) -> tuple[A
 
 def _off(found: _Matched, there: Beside) -> Array:
     """(n,) distance in px of the band between places and where a camera has them."""
-    px = there.sees(rays(found.camera_a, found.px_a), found.nearness, found.velocity)
+    ray_a = rays(found.camera_a, found.px_a)
+    px = there.sees(ray_a, found.nearness, found.velocity, found.late_s)
     return np.asarray(np.linalg.norm(px - found.px_b, axis=1))

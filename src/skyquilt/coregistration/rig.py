@@ -8,10 +8,14 @@ Shutters of two cameras are seldom released at once, and a drone flies some cent
 hundredth of a second. Where it flies the same way in all photos as the camera sees it, the rotation
 takes that up. Where it does not (the camera keeps its heading on all lines), rotations of pairs
 differ, each along its flight: then one delay of the second camera explains them all.
+
+A second camera that exposes by its own clock, several times a second, is late by another time in
+each pair. Their recorded times are used where they bring the pairs nearer to one rotation.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -42,6 +46,8 @@ class RigPair:
     """(n, 3) velocity of the first camera along its own axes over the distance of what each px
     shows, 1/s; None where it is not known.
     """
+    late_s: float = 0.0
+    """By how much later the second photo says that it was taken, s, beside what is usual."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -54,12 +60,18 @@ class _Looks:
     """By the second one."""
     pace: Array
     """(n, 3) `RigPair.pace`, 0 where it is not known."""
+    late_s: float
+    """`RigPair.late_s`."""
 
     def late(self, delay_s: float) -> Array:
         """(n, 3) where the second camera, exposed so much later, sees what the first one shows,
         along the axes of the first.
         """
         return np.asarray(self.a - delay_s * self.pace)
+
+    def as_timed(self) -> "_Looks":
+        """The same where the second camera was when its photo says that it was taken."""
+        return replace(self, a=self.late(self.late_s), late_s=0.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,6 +92,8 @@ class Rig:
     """(3,) where the second camera is, m along the axes of the first."""
     delay_s: float = 0.0
     """How much later than the first camera the second one is exposed, s; 0 where nothing tells."""
+    timed: bool = False
+    """Whether `RigPair.late_s` comes to that in each pair: the pairs agree better with it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +114,7 @@ class FindRig:
     """A delay is taken if it lies that many standard deviations from none, by how much nearer to
     one rotation it brings the pairs.
     """
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
 
     def __call__(self, pairs: Sequence[RigPair], camera_b: Camera) -> Rig | RefusedRegistration:
         """The rig, or the reason why there is none."""
@@ -111,7 +125,7 @@ class FindRig:
             )
         if self.free > 0:
             camera_b = self._focal(pairs, camera_b)
-        looks = [_looks(p, camera_b) for p in pairs]
+        looks, timed = self._timed([_looks(p, camera_b) for p in pairs])
         delay = self._delay(looks)
         off = _apart(looks, delay)
         agreeing = [p for p, o in zip(looks, off, strict=True) if o < self.agree_deg]
@@ -127,7 +141,20 @@ class FindRig:
             pairs=len(pairs),
             spread_deg=float(np.median(off[off < self.agree_deg])),
             delay_s=delay,
+            timed=timed,
         )
+
+    def _timed(self, looks: Sequence[_Looks]) -> tuple[Sequence[_Looks], bool]:
+        """What the pairs see where the second camera was by the recorded times, and True, if that
+        brings them clearly nearer to one rotation; else as they are, and False.
+        """
+        if not any(p.late_s and p.pace.any() for p in looks):
+            return looks, False
+        by_times = [p.as_timed() for p in looks]
+        plain, timed = (_mean_deg(found, self._delay(found)) for found in (looks, by_times))
+        if 2 * len(looks) * np.log(plain / timed) > self.sure**2 / 2:
+            return by_times, True
+        return looks, False
 
     def _delay(self, looks: Sequence[_Looks]) -> float:
         """The delay in s at which the pairs' rotations lie nearest to a common one; 0 where none
@@ -135,13 +162,10 @@ class FindRig:
         the logarithm of the likelihood is -2 n log(mean r), and rises by half the square of the
         number of standard deviations.
         """
-
-        def mean_deg(delay: float) -> float:
-            return max(float(_apart(looks, delay).mean()), 1e-3)
-
         if not any(p.pace.any() for p in looks):
             return 0.0
         tried = np.linspace(-self.longest_s, self.longest_s, _DELAYS)
+        mean_deg = partial(_mean_deg, looks)
         near, step = float(min(tried, key=mean_deg)), float(tried[1] - tried[0])
         best = minimize_scalar(
             mean_deg, bounds=(near - step, near + step), method="bounded", options={"xatol": 1e-3}
@@ -172,7 +196,8 @@ def _unit(camera: Camera, px: Array) -> Array:
 
 def _looks(pair: RigPair, camera_b: Camera) -> _Looks:
     a, b = _unit(pair.camera_a, pair.px_a), _unit(camera_b, pair.px_b)
-    return _Looks(a=a, b=b, pace=np.zeros_like(a) if pair.pace is None else pair.pace)
+    pace = np.zeros_like(a) if pair.pace is None else pair.pace
+    return _Looks(a=a, b=b, pace=pace, late_s=pair.late_s)
 
 
 def _apart(looks: Sequence[_Looks], delay_s: float) -> Array:
@@ -180,6 +205,11 @@ def _apart(looks: Sequence[_Looks], delay_s: float) -> Array:
     own = [_rotation([p], delay_s) for p in looks]
     common = median_rotation(own)
     return np.array([angle_deg(R, common) for R in own])
+
+
+def _mean_deg(looks: Sequence[_Looks], delay_s: float) -> float:
+    """Mean of these angles."""
+    return max(float(_apart(looks, delay_s).mean()), 1e-3)
 
 
 def _rotation(looks: Sequence[_Looks], delay_s: float) -> Array:

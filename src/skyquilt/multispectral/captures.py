@@ -11,7 +11,7 @@ from skyquilt.model.bands import canonical
 from skyquilt.model.photo import Photo
 from skyquilt.multispectral.reflectance import KINDS, Kind, Reflectance, smoothed_irradiance
 from skyquilt.photos.band_tags import BandTags, read_band_tags
-from skyquilt.photos.together import SECONDS, clocks, nearest_in_time, taken_together
+from skyquilt.photos.together import SECONDS, clocks, nearest_in_time, taken_together, whole_seconds
 
 THERMAL = "lwir"
 """The band of temperatures, which says nothing of reflectance."""
@@ -139,5 +139,4 @@ def _at_once(a: Sequence[Photo], b: Sequence[Photo]) -> list[tuple[int, int]]:
 
 def _same_second(a: Sequence[Photo], b: Sequence[Photo]) -> list[tuple[int, int]]:
     """Files less than a second apart, where the times of either camera are whole seconds."""
-    whole = [all(p.time is None or p.time.microsecond == 0 for p in photos) for photos in (a, b)]
-    return nearest_in_time(a, b, 1.0) if any(whole) else []
+    return nearest_in_time(a, b, 1.0) if whole_seconds(a) or whole_seconds(b) else []

@@ -70,6 +70,22 @@ def nearest_in_time(a: Sequence[Photo], b: Sequence[Photo], most_s: float) -> li
     return sorted(((i, j) for i, (_, j) in nearest.items()), key=lambda pair: pair[1])
 
 
+def late_by(a: Sequence[Photo], b: Sequence[Photo]) -> NDArray[np.float64]:
+    """(n,) how much later than its partner of `a` each photo of `b` says that it was taken, s,
+    beside the median of all; 0 where the times of either camera are whole seconds, or tell nothing.
+    """
+    gaps = clocks(b) - clocks(a)
+    zoned = [p.time is not None and p.time.tzinfo is not None for p in (*a, *b)]
+    if not np.isfinite(gaps).any() or whole_seconds(a) or whole_seconds(b) or len(set(zoned)) > 1:
+        return np.zeros(len(gaps))
+    return np.nan_to_num(gaps - np.nanmedian(gaps))
+
+
+def whole_seconds(photos: Sequence[Photo]) -> bool:
+    """Whether no photo tells a part of a second."""
+    return all(p.time is None or p.time.microsecond == 0 for p in photos)
+
+
 def clocks(photos: Sequence[Photo]) -> NDArray[np.float64]:
     """(n,) times in s by the photos' own clocks, whatever their zones; NaN where there is none."""
     return np.array(

@@ -34,7 +34,7 @@ from skyquilt.ortho.radiometry import DriftMethod, balances_drift, drift_of, val
 from skyquilt.photos.left_out import told_left_out, without_partner
 from skyquilt.photos.pixels import read_color
 from skyquilt.photos.read import rejected
-from skyquilt.photos.together import taken_together
+from skyquilt.photos.together import late_by, taken_together
 from skyquilt.raster import CogWriter, RasterSpec
 from skyquilt.settings import PictureSettings
 from skyquilt.workflows.flow import Scene
@@ -118,15 +118,23 @@ def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistrati
         )
     asked = [pairs[k] for k in evenly(len(pairs), MOST_PAIRS)]
     velocity = velocities_of(visual, placed)
+    gaps = late_by([visual[i] for i, _ in pairs], frames).tolist()
+    late = {j: gap for (_, j), gap in zip(pairs, gaps, strict=True)}
     seen = [
-        p for i, j in asked if (p := _registered(scene, i, thermal[j], velocity[i])) is not None
+        replace(p, late_s=late[j])
+        for i, j in asked
+        if (p := _registered(scene, i, thermal[j], velocity[i])) is not None
     ]
     rig = FindRig(free=_freedom(first))(seen, first.lens)
+    if not (isinstance(rig, Rig) and rig.timed):
+        late = dict.fromkeys(late, 0.0)
     if isinstance(rig, Rig) or len(seen) < FindRig.minimum:  # else pairs contradict each other
-        rig = _with_lens(scene, thermal, pairs, velocity, rig)
+        rig = _with_lens(scene, thermal, pairs, velocity, late, rig)
     if isinstance(rig, RefusedRegistration):
         return rig
-    poses = {k: pose_beside(placed.poses[i], rig, velocity[i]) for k, (i, _) in enumerate(pairs)}
+    poses = {
+        k: pose_beside(placed.poses[i], rig, velocity[i], late[j]) for k, (i, j) in enumerate(pairs)
+    }
     alignment = Alignment(
         method="rig",
         why="both cameras were on the same drone",
@@ -167,14 +175,18 @@ def _with_lens(
     thermal: Sequence[Photo],
     pairs: Sequence[tuple[int, int]],
     velocity: Mapping[int, NDArray[np.float64]],
+    late: Mapping[int, float],
     rig: Rig | RefusedRegistration,
 ) -> Rig | RefusedRegistration:
     """The rig with the lens of the thermal camera, from patches of pairs (index of the visual
-    photo, of the thermal one); `rig`: what whole pictures tell, which is kept where patches tell
-    nothing. A strong lens keeps these from being registered by a homography.
+    photo, of the thermal one); `late`: by how many s the latter are; `rig`: what whole pictures
+    tell, which is kept where patches tell nothing. A strong lens keeps these from being registered
+    by a homography.
     """
     first, near = thermal[pairs[0][1]], None
-    seen = seen_together(scene, far(scene, pairs), thermal, velocity, MOST_PAIRS, coloured=True)
+    seen = seen_together(
+        scene, far(scene, pairs), thermal, velocity, MOST_PAIRS, late_s=late, coloured=True
+    )
     if isinstance(rig, Rig):
         turn = np.asarray(Rotation.from_matrix(rig.b_R_a).as_rotvec())
         near = Beside(turn=turn, place=rig.a_t_b[:2], camera=rig.camera_b, delay_s=rig.delay_s)
@@ -190,6 +202,7 @@ def _with_lens(
         a_t_b=found.a_t_b,
         camera_b=found.camera,
         delay_s=found.delay_s,
+        timed=isinstance(rig, Rig) and rig.timed,
         agreeing=agreeing,
         pairs=among,
         spread_deg=spread_deg,

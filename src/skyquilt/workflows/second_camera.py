@@ -3,6 +3,8 @@ map knows of the ground and of the flight.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,11 +40,13 @@ def far(scene: Scene, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, int]]
     return [pair for pair, used in zip(pairs, high, strict=True) if used]
 
 
-def pose_beside(pose: Pose, rig: Rig | BandRig, velocity: NDArray[np.float64]) -> Pose:
-    """The pose of the second camera, exposed when the rig has it, when the map's photo had this
-    one; `velocity` (3,) of the latter, m/s in the map frame.
+def pose_beside(
+    pose: Pose, rig: Rig | BandRig, velocity: NDArray[np.float64], late_s: float = 0.0
+) -> Pose:
+    """The pose of the second camera, exposed so much later than when the rig has it, when the map's
+    photo had this one; `velocity` (3,) of the latter, m/s in the map frame.
     """
-    moved = rig.a_t_b @ pose.cam_R_map + rig.delay_s * velocity
+    moved = rig.a_t_b @ pose.cam_R_map + (rig.delay_s + late_s) * velocity
     return Pose(cam_R_map=rig.b_R_a @ pose.cam_R_map, map_C=pose.map_C + moved)
 
 
@@ -53,15 +57,21 @@ def seen_together(
     velocities: Mapping[int, NDArray[np.float64]],
     most: int,
     *,
+    late_s: Mapping[int, float] = MappingProxyType({}),
     coloured: bool = False,
 ) -> list[Together]:
     """Pictures of at most so many pairs, spread evenly over the flight, without those whose file
     cannot be read. A pair: indices of the map's photo and of one of `photos`; `velocities` (3,) of
-    the former, m/s in the map frame. `coloured`: with the colours of the map's photos.
+    the former, m/s in the map frame; `late_s`: how much later than usual the latter is exposed, by
+    its index. `coloured`: with the colours of the map's photos.
     """
     asked = [pairs[k] for k in evenly(len(pairs), most)]
-    found = (_together(scene, i, photos[j], velocities[i], coloured) for i, j in asked)
-    return [pictures for pictures in found if pictures is not None]
+    found = (
+        replace(pictures, late_s=late_s.get(j, 0.0))
+        for i, j in asked
+        if (pictures := _together(scene, i, photos[j], velocities[i], coloured)) is not None
+    )
+    return list(found)
 
 
 def _together(
