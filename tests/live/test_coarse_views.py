@@ -57,7 +57,8 @@ def test_a_growing_map_shows_the_finer_photos(flight, tmp_path):
     assert len(coarse) == 2
     both = shown = 0
     for address in live.tiles.addresses("visible", 0):
-        compose = live.canvas._composer(address, Feather(width_px=2.0))
+        if (compose := live.canvas._composer(address, Feather(width_px=2.0))) is None:
+            continue  # a photo that moved since has left it empty
         plan = compose.plan(WHOLE)
         drawn = compose.drawn(plan).photo[8::16, 8::16]
         rows, columns = drawn.shape

@@ -249,28 +249,32 @@ def test_hybrid_saves_time_against_searching_the_overview(tmp_path):
 @pytest.mark.slow
 @pytest.mark.long
 def test_surf_registers_the_depth_maps_of_two_spectra(tmp_path):
-    """Y Fig. 5.14c: reconstructions of a visual and of a thermal flight; the georeferences of both,
-    good to 5 cm, are the truth.
+    """Y Fig. 5.14c: reconstructions of visual and thermal flights of 6 photos; the georeferences of
+    both, good to 5 cm, are the truth. Some ten features agree, and in one flight of five too few.
     """
-    settings = FlightSettings(
-        seed=3,
-        lens=Lens().scaled(800, 600),
-        route=Route(photos=6),
-        reporting=Reporting(gps_noise=0.05),
-        control=Control(points=0, checks=0),
-        thermal=Thermal(overlap=0.75, sidelap=0.5),
-    )
-    for _ in simulate(settings, tmp_path / "flights", overwrite=True):
-        pass
-    asked, maps = MosaicSettings(gsd_cm=25, features=3000, jobs=1), []
-    for name in ("photos", "thermal"):
-        depth(tmp_path / "flights" / name, tmp_path / name, asked, route="reconstruction")
-        maps.append(open_picture(tmp_path / name / "depth.tif"))
-    a, b = maps
-    g, h = a.place.affine, b.place.affine
-    truth = np.eye(3)
-    truth[:2, 2] = (g[2] - h[2]) / h[0], (g[5] - h[5]) / h[4]
-    found = outcome_of(a, b, "surf", None)
-    assert found
-    off = overlap_error(found.b_H_a, truth, (a.height, a.width), (b.height, b.width))
-    assert 0.25 * off < 2.0
+    off = []
+    for seed in range(1, 6):
+        settings = FlightSettings(
+            seed=seed,
+            lens=Lens().scaled(800, 600),
+            route=Route(photos=6),
+            reporting=Reporting(gps_noise=0.05),
+            control=Control(points=0, checks=0),
+            thermal=Thermal(overlap=0.75, sidelap=0.5),
+        )
+        for _ in simulate(settings, tmp_path / "flights", overwrite=True):
+            pass
+        asked, maps = MosaicSettings(gsd_cm=25, features=3000, jobs=1), []
+        for name in ("photos", "thermal"):
+            out = tmp_path / f"{name}{seed}"
+            depth(tmp_path / "flights" / name, out, asked, route="reconstruction")
+            maps.append(open_picture(out / "depth.tif"))
+        a, b = maps
+        g, h = a.place.affine, b.place.affine
+        truth = np.eye(3)
+        truth[:2, 2] = (g[2] - h[2]) / h[0], (g[5] - h[5]) / h[4]
+        if found := outcome_of(a, b, "surf", None):
+            sizes = (a.height, a.width), (b.height, b.width)
+            off.append(0.25 * overlap_error(found.b_H_a, truth, *sizes))
+    assert len(off) >= 4
+    assert np.median(off) < 2.0 and max(off) < 4.0
