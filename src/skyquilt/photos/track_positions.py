@@ -17,6 +17,7 @@ from skyquilt.model.clip import Track
 from skyquilt.model.photo import Photo
 from skyquilt.photos.position_tables import has_header
 from skyquilt.photos.side_rows import SideRow, sentence_of
+from skyquilt.photos.together import whole_seconds
 from skyquilt.video.positions import METRES_PER_DEGREE, places_at, position_at
 from skyquilt.video.tracks import is_timed_csv, read_track, unix_s
 
@@ -27,6 +28,8 @@ MOVING = 0.7
 """Speed in m/s from which a receiver is flying, or carried."""
 CLOCK_S = 1.0
 """Deviation of a camera's clock that nothing tells, in s."""
+ROUNDED_S = float(1 / np.sqrt(12))
+"""Deviation of times in whole seconds, in s."""
 ALIKE = 0.9
 """Share of the most photos with which another time zone fits, too."""
 _PER_DAY_DEG = 15.0
@@ -87,12 +90,13 @@ def read_track_rows(
     times = taken + best.offset_s
     places, speed = places_at(track, times), _speed(track, times)
     unsure = 0.0 if clock_offset_s is not None else CLOCK_S
+    late_s = np.hypot(unsure, ROUNDED_S if whole_seconds(timed) else 0.0)
     rows = []
     for k, photo in enumerate(timed):
         found = position_at(track, places, k, float(times[k]))
         if found is None:
             continue
-        along = float(np.nan_to_num(speed[k])) * np.hypot(unsure, _rounding_s(timed))
+        along = float(np.nan_to_num(speed[k])) * late_s
         rows.append(
             SideRow(
                 name=photo.name,
@@ -137,12 +141,6 @@ def _from_sun(fit: _Fit, track: Track) -> float:
     summer = abs(latitude) > _SUMMER_DEG and (_SUMMER[0] <= month <= _SUMMER[1]) == (latitude > 0)
     sun = float(np.median(track.longitude_deg)) / _PER_DAY_DEG + summer
     return abs(hours - sun) + _ODD_H * (hours % 1 != 0)
-
-
-def _rounding_s(photos: Sequence[Photo]) -> float:
-    """Deviation of times that have whole seconds, in s."""
-    whole = all(p.time is not None and p.time.microsecond == 0 for p in photos)
-    return 1 / np.sqrt(12) if whole else 0.0
 
 
 def _clock(seconds: float) -> str:
