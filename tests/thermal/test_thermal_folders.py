@@ -15,10 +15,13 @@ class MappedError(Exception):
 
 
 def mapped(monkeypatch, photos, thermal, output):
-    """Names of the photos that would be mapped, visual and thermal, and what was said."""
-    seen = []
+    """Names of the photos that would be mapped, visual and thermal, and what was said, also of the
+    visual survey.
+    """
+    seen, notes = [], []
 
     def make_map(given, *_, **__):
+        notes.extend(given.survey.notes)
         seen.append([p.name for p in given.survey.photos])
         raise MappedError
         yield
@@ -32,7 +35,7 @@ def mapped(monkeypatch, photos, thermal, output):
     with pytest.raises(MappedError):
         for event in iter_thermal(photos, thermal, output, MosaicSettings()):
             said.append(event.text)
-    return seen[1], seen[0], said
+    return seen[1], seen[0], [*said, *notes]
 
 
 @pytest.fixture
@@ -59,6 +62,7 @@ def test_one_folder_of_both_gives_each_map_its_photos(folder, tmp_path, monkeypa
     assert heat == [f"DJI_{k:04d}_T.tif" for k in range(3)]
     assert any("3 thermal photos in the folder" in t and "visual map" in t for t in said)
     assert any("6 visible photos in the folder" in t and "thermal map" in t for t in said)
+    assert not any("spectra are mixed" in t for t in said)  # no map shows both
 
 
 def test_the_visible_photos_alone_are_no_thermal_flight(folder, tmp_path):

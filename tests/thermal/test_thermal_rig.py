@@ -104,11 +104,13 @@ def test_frames_of_other_ground_are_refused(flight, frames, output, tmp_path):
 
 @pytest.mark.slow
 def test_frames_that_are_not_drawn_are_named(flight, frames, output, tmp_path):
-    """One is damaged behind a whole header, so this is met only when its values are read; another
-    has no visual photo beside it.
+    """One is damaged behind a whole header, so this is met only when its values are read; one has
+    another size, as a reduced copy, for which all were placed by their own map; another has no
+    visual photo beside it.
     """
     shutil.copytree(frames, tmp_path / "heat")
-    bad = sorted((tmp_path / "heat").glob("*.tif"))[2]
+    bad, small = sorted((tmp_path / "heat").glob("*.tif"))[2:4]
+    tifffile.imwrite(small, tifffile.imread(small)[::2, ::2])
     tifffile.imwrite(tmp_path / "heat" / "heat_9999.tif", tifffile.imread(bad)[::-1])
     tifffile.imwrite(bad, tifffile.imread(bad), compression="zlib")
     whole = bad.read_bytes()
@@ -116,8 +118,9 @@ def test_frames_that_are_not_drawn_are_named(flight, frames, output, tmp_path):
     *before, last = iter_thermal(flight / "photos", tmp_path / "heat", output, SETTINGS)
     assert isinstance(last, Result)
     told = last.metrics["thermal"]
-    assert told["route"] == "rig" and told["photos_used"] == 8 and told["photos_total"] == 10
-    assert list(told["photos_rejected"]) == [bad.name, "heat_9999.tif"]
+    assert told["route"] == "rig" and told["photos_used"] == 7 and told["photos_total"] == 10
+    assert list(told["photos_rejected"]) == [bad.name, small.name, "heat_9999.tif"]
+    assert "of another camera or format" in told["photos_rejected"][small.name]
     alone = "no visual photo was taken together with it"
     assert told["photos_rejected"]["heat_9999.tif"] == alone
     assert Note(text=f"heat_9999.tif is left out: {alone}") in before

@@ -1,5 +1,6 @@
 """Thermal photos placed by the poses and the surface of visual photos taken by the same drone."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -56,6 +57,10 @@ _DOUBLED = (
     " thermal camera by itself"
 )
 """Why photos of a second thermal camera are not drawn."""
+_FEW = 0.2
+"""Share of the thermal photos up to which those of another camera or format are exceptions."""
+_ANOTHER = "it is of another camera or format than most of the thermal photos"
+"""Why they are not drawn."""
 _GRID = 6
 """Points per side of the grid from which the rotation of a registered pair is computed."""
 
@@ -99,7 +104,7 @@ def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistrati
         for p in without_partner(thermal, beside, placed.poses, "visual photo")
     ]
     bad = {j: r for _, j in together if (r := _undecodable(thermal[j])) is not None}
-    pairs = [(i, j) for i, j in together if j not in bad]
+    pairs, other = _of_one_camera(thermal, [(i, j) for i, j in together if j not in bad])
     if len(pairs) < FindRig.minimum:
         return RefusedRegistration(
             reason=f"{len(pairs)} thermal photos were taken together with a visual one, by time or"
@@ -111,7 +116,7 @@ def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistrati
         )
     first = thermal[pairs[0][1]]
     frames = [thermal[j] for _, j in pairs]
-    kinds = {(p.camera_key, p.channels, p.dtype, p.unit) for p in frames}
+    kinds = set(map(_kind, frames))
     if len(kinds) > 1:
         return RefusedRegistration(
             reason=f"the thermal photos are from {len(kinds)} cameras or formats"
@@ -146,7 +151,8 @@ def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistrati
         ties=no_ties(),
     )
     photos = tuple(thermal[j] for _, j in pairs)
-    return Rigged(rig=rig, photos=photos, alignment=alignment, rejected=(*bad.values(), *alone))
+    left = (*bad.values(), *other, *alone)
+    return Rigged(rig=rig, photos=photos, alignment=alignment, rejected=left)
 
 
 def _beside(
@@ -168,6 +174,27 @@ def _beside(
         beside |= {j: i for j, i in pairs.items() if i not in taken}
         doubled |= {thermal[j].name for j, i in pairs.items() if i in taken}
     return beside, frozenset(doubled)
+
+
+def _of_one_camera(
+    thermal: Sequence[Photo], pairs: Sequence[tuple[int, int]]
+) -> tuple[list[tuple[int, int]], list[RejectedPhoto]]:
+    """The pairs (index of the visual photo, of the thermal one) without the few whose thermal photo
+    is of another camera or format than most, such as a reduced copy; all of them where these are
+    not few.
+    """
+    kinds = [_kind(thermal[j]) for _, j in pairs]
+    usual, n = Counter(kinds).most_common(1)[0] if kinds else (None, 0)
+    if len(kinds) - n > _FEW * len(kinds):
+        return list(pairs), []
+    kept = [pair for pair, kind in zip(pairs, kinds, strict=True) if kind == usual]
+    other = [thermal[j].name for (_, j), k in zip(pairs, kinds, strict=True) if k != usual]
+    return kept, [RejectedPhoto(name=name, reason=_ANOTHER) for name in other]
+
+
+def _kind(photo: Photo) -> tuple[str, int, str, str]:
+    """Camera and format: what the photos of one raster have in common."""
+    return photo.camera_key, photo.channels, photo.dtype, photo.unit
 
 
 def _with_lens(

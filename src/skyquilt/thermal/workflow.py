@@ -35,6 +35,7 @@ from skyquilt.model.photo import RejectedPhoto, Survey
 from skyquilt.model.registration import RefusedRegistration, Registration
 from skyquilt.ortho.radiometry import recorded_tags, value_figures
 from skyquilt.photos.guesses import as_thermal
+from skyquilt.photos.survey import survey_notes
 from skyquilt.photos.together import taken_together
 from skyquilt.settings import DEFAULTS, MosaicSettings, PictureSettings
 from skyquilt.thermal.by_heights import finer
@@ -178,6 +179,9 @@ def _of_spectrum(given: SurveyInput, band: str, map_: str) -> tuple[SurveyInput,
         return given, ()
     reason = f"it is a {others[0].band} photo, and {map_} shows the {band} ones"
     kept = given.without([RejectedPhoto(name=p.name, reason=reason) for p in others])
+    of_all, of_these = survey_notes(given.survey.photos), survey_notes(kept.survey.photos)
+    notes = (*(n for n in given.survey.notes if n not in of_all), *of_these)
+    kept = replace(kept, survey=replace(kept.survey, notes=notes))
     named = f"{len(others)} {others[0].band} photos in the folder, such as {others[0].name},"
     return kept, (f"{named} are left out of {map_}",)
 
