@@ -1,5 +1,7 @@
 """Rasters that name other files or addresses are not read, whatever they are called."""
 
+import os
+
 import numpy as np
 import pytest
 import rasterio
@@ -45,6 +47,17 @@ def test_a_file_that_names_others_is_not(lure):
         FileSource(path=lure).about()
     with pytest.raises(UsageError, match="not a georeferenced map"):
         base_map(lure)
+
+
+def test_a_name_that_is_no_text_gets_a_sentence(tmp_path):
+    """GDAL takes names as UTF-8 only; `register` ended in a traceback."""
+    try:
+        path = written(tmp_path / "map.tif").rename(tmp_path / os.fsdecode(b"map \xff.tif"))
+    except OSError:
+        pytest.skip("this file system wants names to be text")
+    assert open_map(path) is None
+    with pytest.raises(SideFileError, match="no UTF-8 text; rename it"):
+        FileSource(path=path).about()
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.img", "a.jp2"])

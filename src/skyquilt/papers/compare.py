@@ -26,7 +26,6 @@ from skyquilt.photos.distances import read_distances
 from skyquilt.photos.gcp import read_gcp_list
 from skyquilt.raster.atomic import write_text
 from skyquilt.raster.drivers import GEOTIFF
-from skyquilt.report.page import write_page
 from skyquilt.settings import DEFAULTS, MosaicSettings
 from skyquilt.typed import typed
 from skyquilt.version import __version__
@@ -148,7 +147,7 @@ def iter_compare(
     if base.input.distances is None:
         record = _by_baselines(record, given, output, base.picture.crs)
     write_text(output / "compare.json", json.dumps(record, indent=1, allow_nan=False))
-    write_page(output / "report.html", comparison_page(record, _previews(output, order)))
+    write_text(output / "report.html", comparison_page(record, _previews(output, order)))
     state.done = True
     state.write(output)
     yield Result(output=output, metrics=record)

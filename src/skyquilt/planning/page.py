@@ -10,12 +10,13 @@ from shapely.geometry.base import BaseGeometry
 from skyquilt.planning.coverage import Cells
 from skyquilt.planning.lattice import to_uv
 from skyquilt.planning.records import Array, Plan
+from skyquilt.raster.atomic import write_text
 from skyquilt.raster.map_source import picture
 from skyquilt.raster.older_map import older_map
 from skyquilt.report import images
 from skyquilt.report.layers import MOST_VIEWS, view_colours
 from skyquilt.report.numbers import fixed, seconds
-from skyquilt.report.page import plain_page, write_page
+from skyquilt.report.page import plain_page
 from skyquilt.report.parts import Figure, LegendItem, Section, Sentences, Table, Tile
 from skyquilt.report.svg import dots, polyline
 from skyquilt.version import __version__
@@ -33,7 +34,7 @@ def write_plan_page(
     """Writes the page; `views`: photos that see each cell, flat; `base`: an old map to draw
     below.
     """
-    write_page(path, plan_page(plan, cells, views, base))
+    write_text(path, plan_page(plan, cells, views, base))
 
 
 def plan_page(plan: Plan, cells: Cells, views: NDArray[np.int32], base: Path | None) -> str:

@@ -1,7 +1,6 @@
 """Builds the page: sections in order, one template, one file."""
 
 import re
-from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
@@ -9,8 +8,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 from skyquilt.engine.folder import FILES
-from skyquilt.errors import OutputError
-from skyquilt.outside import put_in_place
+from skyquilt.raster.atomic import write_text
 from skyquilt.report import headline
 from skyquilt.report.about import facts_of, photos_section
 from skyquilt.report.attention import attention
@@ -77,23 +75,7 @@ def build_report(data: ReportInput) -> str:
 
 def write_report(path: Path, data: ReportInput) -> None:
     """Builds the page and writes it to `path` atomically; `OutputError` if it cannot be written."""
-    write_page(path, build_report(data))
-
-
-def write_page(path: Path, page: str) -> None:
-    """Writes a page to `path` atomically; `OutputError` if it cannot be written."""
-    path = Path(path)
-    partial = path.with_name(path.name + ".partial")
-    try:
-        partial.write_text(page, encoding="utf-8")
-        put_in_place(partial, path)
-    except OSError as error:
-        with suppress(OSError):
-            partial.unlink()
-        raise OutputError(
-            f"the report cannot be written to {path}: {error.strerror or error}. "
-            "Make room or choose another output folder."
-        ) from error
+    write_text(path, build_report(data))
 
 
 def tied(words: str) -> str:
@@ -154,7 +136,7 @@ def add_section(output: Path, section: Section) -> None:
     """Adds a section to the report of a finished run, if it has one; a former one is replaced."""
     page = output / "report.html"
     if page.is_file():
-        write_page(page, with_section(page.read_text(encoding="utf-8"), section))
+        write_text(page, with_section(page.read_text(encoding="utf-8"), section))
 
 
 def with_section(page: str, section: Section) -> str:
