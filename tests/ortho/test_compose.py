@@ -55,6 +55,34 @@ def exact_pixels(views, grid=GRID):
     return px, np.where(seen, tangent2, np.inf), seen
 
 
+@pytest.mark.parametrize("blend", [Feather(), First()], ids=lambda b: type(b).__name__)
+def test_where_a_frame_has_no_value_another_is_shown(scene, blend):
+    """Pixels and parts without a value in single frames were holes of the map, though other frames
+    show the ground there.
+    """
+    (views, pictures), rng = scene, np.random.default_rng(8)
+    frames = {k: picture.astype(np.float32) for k, picture in pictures.items()}
+    for frame in frames.values():
+        frame[rng.random(frame.shape) < 0.01] = np.nan
+        y, x = rng.integers(20, 60, 2)
+        frame[y : y + 20, x : x + 30] = np.nan
+    made = composer(views, frames, GRID, blend, dtype=np.float32)(WHOLE)
+    px, _, seen = exact_pixels(views)
+    known = np.zeros(made.photo.shape, bool)
+    for (u, v), frame, here in zip(px.transpose(0, 3, 1, 2), frames.values(), seen, strict=True):
+        u, v = u.astype(np.float32), v.astype(np.float32)
+        known |= here & np.isfinite(cv2.remap(frame, u, v, cv2.INTER_LINEAR))
+    finite = np.isfinite(made.pixels[..., 0])
+    assert (finite != known).mean() < 2e-3  # what lies on the rim of a frame or a hole
+    error = made.pixels[..., 0] - truth(GRID)
+    assert np.sqrt((error[finite] ** 2).mean()) < 4.0
+    for k, shot in enumerate(views):  # the frame that is named has the value
+        own = finite & (made.photo == shot.photo)
+        u, v = px[k].transpose(2, 0, 1).astype(np.float32)
+        off = abs(made.pixels[..., 0] - cv2.remap(frames[shot.photo], u, v, cv2.INTER_LINEAR))[own]
+        assert np.isfinite(off).mean() > 0.99 and np.nanmedian(off) < 0.2
+
+
 @pytest.mark.parametrize(
     "blend", [Feather(), First(), Average(), Multiband(levels=3)], ids=lambda b: type(b).__name__
 )

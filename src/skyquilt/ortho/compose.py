@@ -88,6 +88,8 @@ class Composer:
     """Source of the parts of photos that are drawn; None = `pixels`."""
     detailed: bool = False
     """Whether heights may bend between the nodes of a plan; then nodes are set closer there."""
+    valued: bool = False
+    """Whether photos yield to others where they have no value (NaN)."""
 
     def __call__(self, window: Window) -> Composed:
         """Plans and composes a window."""
@@ -179,7 +181,29 @@ class Composer:
         drafts = [self._draft(plan, *box, wanted) for box in boxes]
         found = iter(lifted([part for d in drafts if d is not None for part in d.parts]))
         for d in drafts:
-            yield None if d is None else self._merged(d, [next(found) for _ in d.parts])
+            if d is None:
+                yield None
+            else:
+                yield self._filled(d.place, *self._merged(d, [next(found) for _ in d.parts]))
+
+    def _filled(
+        self, place: Window, pixels: NDArray[Any], photo: NDArray[np.int32]
+    ) -> tuple[NDArray[Any], NDArray[np.int32]]:
+        """A piece with what other photos measured where the one that is shown has no value."""
+        if self.dtype.kind != "f" or self.valued:
+            return pixels, photo
+        empty = (photo >= 0) & np.isnan(pixels).all(2)
+        if not empty.any():
+            return pixels, photo
+        other = replace(self, labels=None, valued=True)
+        plan = other.plan(place, counted=True)
+        around = np.ones((3, 3), np.uint8)
+        near = [cv2.dilate(n.seen.view(np.uint8), around) > 0 for n in plan.nodes]
+        found = other.drawn(replace(plan, near=near))  # also of photos that others hide
+        filled = empty & ~np.isnan(found.pixels).all(2)
+        return np.where(filled[..., None], found.pixels, pixels), np.where(
+            filled, found.photo, photo
+        )
 
     def _draft(
         self, plan: Plan, row: int, column: int, h: int, w: int, wanted: NDArray[np.bool_] | None
@@ -319,6 +343,8 @@ class Composer:
                 within |= more
             np.copyto(score, np.float32(np.inf), where=~within)
         warped = _remapped(image, u, v)
+        if self.valued:
+            np.copyto(score, np.float32(np.inf), where=np.isnan(warped).all(2))
         return self._exposed(n, warped), score
 
     def _exposed(self, n: Nodes, warped: NDArray[Any]) -> NDArray[Any]:
