@@ -124,6 +124,8 @@ def test_frames_that_are_not_drawn_are_named(flight, frames, output, tmp_path):
     alone = "no visual photo was taken together with it"
     assert told["photos_rejected"]["heat_9999.tif"] == alone
     assert Note(text=f"heat_9999.tif is left out: {alone}") in before
+    # that the unit is a guess was told only where the thermal map is one of its own
+    assert any("no unit is stated" in n.text for n in before if isinstance(n, Note))
 
 
 @pytest.mark.slow

@@ -268,6 +268,7 @@ def _by_rig(
     found = rigged(scene, thermal.photos)
     if isinstance(found, RefusedRegistration):
         return found
+    yield from (Note(text=text) for text in thermal.notes)
     yield from rig_notes(found)
     output, metrics = visual.result.output, visual.result.metrics
     while True:
