@@ -624,7 +624,7 @@ def test_names_with_spaces_accents_and_markup(mosaic, photos):
 
 @pytest.mark.slow
 def test_names_that_are_no_text(mosaic, photos):
-    """Linux allows any bytes in names, also of folders: the report of these ended in a traceback."""
+    """Linux allows any bytes in names, also of folders: reports of these ended in a traceback."""
     first = named(photos)[0]
     try:
         first.rename(photos / os.fsdecode(b"\xff\xfe.jpg"))
