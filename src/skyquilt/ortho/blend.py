@@ -101,7 +101,7 @@ class Feather:
     width_px: float = 6.0
     """Width of the blend in map pixels; 0 = hard seams. Measured values are never mixed."""
     margin: ClassVar[int] = 0
-    version: ClassVar[int] = 5
+    version: ClassVar[int] = 6
 
     @property
     def seam_px(self) -> float:
@@ -197,7 +197,7 @@ class First:
 
     margin: ClassVar[int] = 0
     seam_px: ClassVar[None] = None
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
 
     def rank(self, order: Order, score: Float) -> Float:
         """Order of capture."""
@@ -220,7 +220,7 @@ class Average:
 
     margin: ClassVar[int] = 0
     seam_px: ClassVar[None] = None
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
 
     def rank(self, order: Order, score: Float) -> Float:
         """The angle off the vertical; it determines which photo is recorded as the source."""
@@ -250,7 +250,7 @@ class Multiband:
     levels: int = 5
     """Levels of the Laplacian pyramid; the widest blend is about 2 ** levels px."""
     seam_px: ClassVar[float] = 0.0
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
 
     @property
     def margin(self) -> int:
