@@ -47,6 +47,11 @@ class View:
     limits: ViewLimits = USUAL
     """What it may show."""
 
+    @property
+    def middle(self) -> NDArray[np.float64]:
+        """(2,) middle of what it shows in m (map frame): of the footprint's bounding box."""
+        return np.asarray((self.footprint.min(0) + self.footprint.max(0)) / 2)
+
     def overlaps(self, bounds: tuple[float, float, float, float]) -> bool:
         """Whether the footprint's bounding box intersects bounds (west, south, east, north)."""
         low, high = self.footprint.min(0), self.footprint.max(0)

@@ -115,7 +115,9 @@ class Stereo:
     things that stand are at least as high; 0 = every pair is.
     """
     base: tuple[float, float] = (0.08, 0.65)
-    """Least and greatest ratio of baseline to height of a pair."""
+    """Least and greatest ratio of baseline to the distance of what a pair shows: its height where
+    photos look straight down, more where they look aslant.
+    """
     best_base: float = 0.25
     """The ratio that is preferred."""
     widest: float = 1.2
@@ -128,7 +130,7 @@ class Stereo:
     """Side of a cell in pixels of the finest pictures that are matched, within `cell_px`."""
     cell_px: tuple[int, int] = (4, 8)
     """Least and greatest side of a cell in map pixels."""
-    version: ClassVar[int] = 9
+    version: ClassVar[int] = 10
 
     def __call__(
         self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture, keep: Keep
@@ -183,6 +185,12 @@ class Stereo:
     ) -> tuple[Surface, Mask]:
         """Heights from small pictures, without gaps, and the cells that have some of their own."""
         gsd = extent / self.coarse.longest
+        pairs = [
+            (p, self.coarse)
+            for a, b in self.pairs(views, height, self.coarse.wanted)
+            if (p := _over(a, b, surface, gsd)) is not None
+        ]
+        gsd = min((p.gsd for p, _ in pairs), default=gsd)
         cells = grid.coarser(max(1, round(1.5 * gsd / grid.gsd), least_cell(grid)))
         given = _Round(
             cells=cells,
@@ -192,11 +200,6 @@ class Stereo:
             agree=0.04 * height,
             held_bytes=1e6 * self.held_mb,
         )
-        pairs = [
-            (p, self.coarse)
-            for a, b in self.pairs(views, height, self.coarse.wanted)
-            if (p := _over(a, b, surface, gsd)) is not None
-        ]
         z = _fused(given, pairs, "coarse", keep)
         known = without_specks(z, 0.02 * height, 12)
         if not known.any():
@@ -218,9 +221,10 @@ class Stereo:
         first, until every place is seen by `wanted` of them.
         """
         centre = np.array([v.pose.map_C[:2] for v in views])
-        i, j = pairs_within(centre, self.widest * height)
-        ratio = np.hypot(*(centre[j] - centre[i]).T) / height
-        apart = ratio >= self.base[0]
+        away = np.array([_away(v, height) for v in views])
+        i, j = pairs_within(centre, self.widest * float(away.max()))
+        ratio = np.hypot(*(centre[j] - centre[i]).T) / ((away[i] + away[j]) / 2)
+        apart = (ratio >= self.base[0]) & (ratio <= self.widest)
         i, j, ratio = i[apart], j[apart], ratio[apart]
         order = np.lexsort((j, i, np.round(np.abs(np.log(ratio / self.best_base)), 1)))
         i, j, wide = i[order], j[order], ratio[order] > self.base[1]
@@ -359,11 +363,19 @@ def _near(
 
 
 def _over(a: View, b: View, known: Surface, gsd: float) -> Pair | None:
-    """The pair of two photos over the heights known between them; pixels of gsd m."""
-    x, y = ((a.pose.map_C + b.pose.map_C) / 2)[:2]
-    reach = 0.3 * (float(a.pose.map_C[2]) - float(known.at(x, y)))
-    gx, gy = np.meshgrid(*(c + reach * np.linspace(-1, 1, 9) for c in (x, y)))
-    return pair_of(a, b, float(np.median(known.at(gx, gy))), gsd)
+    """The pair of two photos over the heights known in the middle of what they show; pixels of gsd
+    m where they look straight down, and larger where they look aslant, as the photos' own are.
+    """
+    x, y = (a.middle + b.middle) / 2
+    height = float(a.pose.map_C[2]) - float(known.at(x, y))
+    gx, gy = np.meshgrid(*(c + 0.3 * height * np.linspace(-1, 1, 9) for c in (x, y)))
+    further = (_away(a, height) + _away(b, height)) / (2 * height)
+    return pair_of(a, b, float(np.median(known.at(gx, gy))), gsd * further)
+
+
+def _away(view: View, height: float) -> float:
+    """How far in m a photo `height` m above ground is from the middle of what it shows."""
+    return float(np.hypot(height, np.hypot(*(view.middle - view.pose.map_C[:2]))))
 
 
 def _sampled(pair: Pair, surface: Surface) -> Float:
