@@ -10,14 +10,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from skyquilt.alignment import start
 from skyquilt.alignment.similarity_graph import (
     PlaneLink,
+    against_positions,
     components,
+    consistent_blocks,
     fit_similarity,
     solve_block,
     tie_to_positions,
 )
-from skyquilt.alignment.start import NOMINAL_HEIGHT_M, _consistent_blocks, georeference, ground_of
+from skyquilt.alignment.start import NOMINAL_HEIGHT_M, georeference, ground_of
 from skyquilt.model.poses import MapFrame, Prior
 
 
@@ -103,12 +106,77 @@ def test_outlier_links_are_outvoted_and_named():
         links[k] = PlaneLink(
             a=i, b=j, b_S_a=b_S_a, p_a=links[k].p_a, p_b=links[k].p_b + 0.5, weight=30.0
         )
-    solutions, kept = _consistent_blocks(len(a), {(k.a, k.b): k for k in links})
+    solutions, kept = consistent_blocks(len(a), {(k.a, k.b): k for k in links})
     assert len(solutions) == 1
     assert {(links[k].a, links[k].b) for k in range(len(links)) if k not in wrong} == kept
     found_a, found_t = aligned(solutions[0], a, t)
     assert np.abs(found_a / a - 1).max() < 0.02
     assert np.abs(found_t - t).max() < 2.5
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_lines_join_by_most_links_between_them(seed):
+    """Lines over rows that look alike: eight weak links between the two are right, six stronger
+    ones are off by the same whole rows.
+    """
+    a, t = plane(seed, lines=2, per_line=7)
+    rng = np.random.default_rng(seed)
+    links = [link(a, t, i, i + 1, rng, weight=200.0) for i in range(len(a) - 1) if i != 6]
+    pairs = [(i, j) for i in range(7) for j in range(7, 14) if abs(t[i] - t[j]) < 45]
+    off = 25 * np.exp(1j * rng.uniform(0, 2 * np.pi))
+    for k, n in enumerate(rng.choice(len(pairs), 14, replace=False)):
+        i, j = pairs[n]
+        right = link(a, t, i, j, rng, shift_noise=0.003, weight=35.0)
+        links.append(right if k < 8 else replace(right, p_b=right.p_b + off / a[j], weight=40.0))
+    _, kept = consistent_blocks(len(a), {(k.a, k.b): k for k in links})
+    assert kept == {(k.a, k.b) for k in links[:-6]}
+
+
+def lines_and_false_links(seed, false, weight=40.0):
+    """Links of two lines that nothing right joins, and as many false ones between them; the
+    translations (n,) of the photos in m.
+    """
+    a, t = plane(seed, lines=2, per_line=7)
+    rng = np.random.default_rng(seed)
+    links = [link(a, t, i, i + 1, rng, weight=60.0) for i in range(len(a) - 1) if i != 6]
+    for k in range(false):  # photos beside each other look like one place, about
+        right = link(a, t, 2 * k, 13 - 2 * k, rng)
+        off = (t[2 * k] - t[13 - 2 * k] + 2) / a[13 - 2 * k]
+        links.append(replace(right, p_b=right.p_b - off, weight=weight))
+    return links, t
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_weak_links_contradict_positions(seed):
+    """Those that are false, and no others; none where they are strong or many, or where positions
+    lie as links have it.
+    """
+    links, t = lines_and_false_links(seed, 3)
+    rng = np.random.default_rng(seed)
+    position = 3.0 * t + 2 * (rng.normal(size=len(t)) + 1j * rng.normal(size=len(t)))
+    sigma = np.full(len(t), 2.0)
+    assert against_positions(links, position, sigma) == links[-3:]
+    assert against_positions(links, np.full(len(t), np.nan + 0j), sigma) == []
+    assert against_positions(links[:-3], position, sigma) == []
+    strong, _ = lines_and_false_links(seed, 3, weight=90.0)
+    assert against_positions(strong, position, sigma) == []
+    assert against_positions(links[5:], position, sigma) == links[-3:]
+    assert against_positions(links[7:], position, sigma) == []
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_lines_that_false_links_alone_join_are_placed_by_positions(seed, monkeypatch):
+    monkeypatch.setattr(start, "plane_link", lambda link, photos, features: link)
+    links, t = lines_and_false_links(seed, 3)
+    rng = np.random.default_rng(seed)
+    position = 3.0 * t + rng.normal(size=len(t)) + 1j * rng.normal(size=len(t))
+    told = priors_at(position, sigma=1.0)
+    found = start.find_start([], told, [], links)
+    assert sorted(found.blocks) == [tuple(range(7)), tuple(range(7, 14))]
+    assert max(abs(found.placed[i][1] - 3.0 * t[i]) for i in range(14)) < 4
+    wrong = np.where(np.arange(14) < 7, position, position + 60)  # another flight's correction
+    far = start.find_start([], priors_at(wrong, sigma=1.0), [], links_of(*plane(seed, 2, 7), rng))
+    assert len(far.blocks) == 1
 
 
 def test_separate_groups_are_separate_blocks():
@@ -121,7 +189,7 @@ def test_separate_groups_are_separate_blocks():
         [14, 15, 16, 17, 18, 19, 21, 22, 23],
         [20],
     ]
-    solutions, _ = _consistent_blocks(len(a), {(k.a, k.b): k for k in links})
+    solutions, _ = consistent_blocks(len(a), {(k.a, k.b): k for k in links})
     assert [s.members.tolist() for s in solutions] == [g.tolist() for g in groups[:2]]
 
 

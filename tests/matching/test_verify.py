@@ -49,9 +49,11 @@ def view_pair(
     return pa, pb, right
 
 
-def verified(pa, pb, **options):
-    n = np.arange(len(pa))
-    return Verify(**options)(3, 8, features(pa), features(pb), Matches(index_a=n, index_b=n), WIDTH)
+def verified(pa, pb, *, others=0, **options):
+    """With so many keypoints besides that are not matched."""
+    n, rest = np.arange(len(pa)), np.zeros((others, 2))
+    a, b = (features(np.concatenate([px, rest])) for px in (pa, pb))
+    return Verify(**options)(3, 8, a, b, Matches(index_a=n, index_b=n), WIDTH)
 
 
 @settings(max_examples=25, deadline=None)
@@ -156,3 +158,37 @@ def test_many_matches_at_one_spot_are_no_link():
         pa = rng.uniform(0, (WIDTH, HEIGHT), (80, 2))
         pb = np.array([300.0, 200.0]) + rng.normal(0, 4, (80, 2))
         assert not verified(pa, pb)
+
+
+def rows_of_cars(seed, *, right, chance):
+    """Matches of two photos of rows of cars that lie apart by a shift, six of each car: some are
+    right, the others are of any two cars.
+    """
+    rng = np.random.default_rng(seed)
+    lattice = np.stack(np.meshgrid(np.arange(-25, 26), np.arange(-9, 10)), -1).reshape(-1, 2)
+    turn = np.array([[0.94, 0.34], [-0.34, 0.94]])
+    cars = (lattice * (33, 90)) @ turn + (WIDTH / 2, HEIGHT / 2)
+    views = cars, cars + rng.uniform(-0.3, 0.3, 2) * (WIDTH, HEIGHT)
+    shown = [((px > 0) & (px < (WIDTH, HEIGHT))).all(1) for px in views]
+    both = rng.choice(np.flatnonzero(shown[0] & shown[1]), right)
+    parts = rng.uniform((-12, -30), (12, 30), (right + chance, 6, 2)) @ turn
+    pa, pb = (
+        (px[np.concatenate([both, rng.choice(np.flatnonzero(own), chance)])][:, None] + parts)
+        for px, own in zip(views, shown, strict=True)
+    )
+    known = np.repeat(np.arange(right + chance) < right, 6)
+    return *(px.reshape(-1, 2) + rng.normal(0, 0.5, (len(known), 2)) for px in (pa, pb)), known
+
+
+def test_rows_that_look_alike_are_no_link_by_chance():
+    """Matches among any cars agree with one shift by whole rows, and nearly as well with the next
+    best: that is no link. Where some more are right, these are found.
+    """
+    by_chance = [rows_of_cars(seed, right=0, chance=35)[:2] for seed in range(20)]
+    assert sum(bool(verified(*px, others=900, elsewhere=1.0)) for px in by_chance) > 10
+    assert sum(bool(verified(*px, others=900)) for px in by_chance) < 2
+    for seed in range(10):
+        pa, pb, right = rows_of_cars(seed, right=8, chance=25)
+        link = verified(pa, pb, others=900)
+        assert isinstance(link, Link), (seed, link.reason)
+        assert right[link.index_a].sum() > 40

@@ -22,6 +22,14 @@ MOST_PAIRED = 1500
 """Points of which all pairs are listed."""
 MOST_PAIRS = 600
 """Largest number of pairs of positions tried as a start."""
+LEAST_MOVED, FEWEST_MOVED = 0.1, 5
+"""Links tell the scale by photos at least so many flying heights apart, and so many at least do."""
+AGAINST, TILTED = 6.0, 0.15
+"""A link contradicts positions by so many of their deviations, and by a larger share of the flying
+height than tilts of eight degrees move a picture by.
+"""
+WEAK, MOST_AGAINST = 80, 1 / 3
+"""False links are weaker than so many matches, and fewer than this share of all."""
 Complex = NDArray[np.complex128]
 Index = NDArray[np.int64]
 Array = NDArray[np.float64]
@@ -135,16 +143,17 @@ def _robust_differences(
     unit: float,
     *,
     angular: bool = False,
+    convex: bool = False,
 ) -> Complex:
     """Iteratively reweighted solution; `unit` is the residual at which a link gets half its
-    weight.
+    weight. `convex`: residuals count by their length, so there is no false minimum.
     """
     x = start
     for _ in range(15):
         misfit = d - (x[j] - x[i])
         if angular:
             misfit = misfit.real + 1j * ((misfit.imag + np.pi) % (2 * np.pi) - np.pi)
-        w = weight / unit / np.sqrt(1 + (np.abs(misfit) / unit) ** 2)
+        w = weight / unit * (1 + (np.abs(misfit) / unit) ** 2) ** (-0.25 if convex else -0.5)
         far = np.abs(x - anchor) / sigma_anchor
         wa = 1 / sigma_anchor / np.sqrt(1 + (far / 3) ** 2)
         step = _solve_differences(i, j, misfit, w, len(x), anchor - x, np.maximum(wa, 1e-6))
@@ -170,12 +179,57 @@ def solve_block(members: NDArray[np.int64], links: Sequence[PlaneLink]) -> Plane
     a = np.exp(log_a - log_a[0])
     pa, pb = np.array([link.p_a for link in links]), np.array([link.p_b for link in links])
     d = a[i] * pa - a[j] * pb
-    t = _robust_differences(
-        i, j, d, weight, np.zeros(len(a), complex), np.zeros(len(a), complex), none, 0.03
-    )
+    zero = np.zeros(len(a), complex)
+    t = _robust_differences(i, j, d, weight, zero, zero, none, 0.03, convex=True)
+    t = _robust_differences(i, j, d, weight, t, zero, none, 0.03)
     error = np.abs(a[i] * pa + t[i] - a[j] * pb - t[j])
     turn = np.abs(np.array([link.b_S_a for link in links]) * a[j] / a[i] - 1)
     return PlaneSolution(members=members, a=a, t=t - t[0], link_error=np.maximum(error, 0.5 * turn))
+
+
+def consistent_blocks(
+    count: int, plane: dict[tuple[int, int], PlaneLink]
+) -> tuple[list[PlaneSolution], set[tuple[int, int]]]:
+    """Solutions of the blocks, and the links that agree with them within a tenth of the flying
+    height.
+    """
+    kept = set(plane)
+    solutions: list[PlaneSolution] = []
+    for _ in range(4):
+        links = [plane[key] for key in sorted(kept)]
+        groups = [g for g in components(count, links) if len(g) >= 2]
+        solutions, bad = [], set()
+        for members in groups:
+            inside = set(members.tolist())
+            own = [k for k in links if k.a in inside]
+            solution = solve_block(members, own)
+            limit = max(0.1, 4 * float(np.median(solution.link_error)))
+            bad |= {(k.a, k.b) for k, e in zip(own, solution.link_error, strict=True) if e > limit}
+            solutions.append(solution)
+        if not bad:
+            break
+        kept -= bad
+    return solutions, kept
+
+
+def against_positions(
+    links: Sequence[PlaneLink], position: Complex, sigma: Array
+) -> list[PlaneLink]:
+    """Links by which two photos lie clearly nearer to each other or further apart than by their
+    positions (n,) in m with deviations (n,), NaN where unknown; most links tell the scale. None
+    where they are many or strong: then positions are wrong.
+    """
+    apart = np.array([abs(position[k.b] - position[k.a]) for k in links])
+    moved = np.array([abs(k.p_a - k.p_b / k.b_S_a) for k in links])
+    told = np.isfinite(apart) & (moved > LEAST_MOVED)
+    if told.sum() < FEWEST_MOVED:
+        return []
+    height = float(np.median(apart[told] / moved[told]))
+    error = np.array([np.hypot(sigma[k.a], sigma[k.b]) for k in links])
+    far = np.abs(height * moved - apart) > np.maximum(AGAINST * error, TILTED * height)
+    found = [k for k, contradicts in zip(links, far.tolist(), strict=True) if contradicts]
+    many = len(found) >= MOST_AGAINST * len(links) or any(k.weight >= WEAK for k in found)
+    return [] if many else found
 
 
 def fit_similarity(

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from skyquilt.alignment.similarity_graph import (
     PlaneLink,
     PlaneSolution,
-    components,
+    against_positions,
+    consistent_blocks,
     fit_similarity,
-    solve_block,
     tie_to_positions,
 )
 from skyquilt.geometry.frames import angle_difference_deg, angles_from_cam_R_map
@@ -67,6 +67,10 @@ FOCAL_NOTE = (
     "No file tells the focal length of {0}: heights above take-off and the ground between positions"
     " tell about {1:.0f} px, and heights of the map are as good as that."
 )
+OFF = 5.0
+"""Weak links that contradict positions are left out where positions scatter by so many times their
+deviations with them, but not without: ground that repeats.
+"""
 FEWEST_HEADINGS = 3
 """Fewer headings do not tell what they have in common."""
 
@@ -118,11 +122,35 @@ def find_start(
     links: Sequence[Link],
     ground_m: float = 0.0,
 ) -> Start:
-    """Solves every block, removes links that contradict it, and georeferences it by its
-    positions. `ground_m`: height of the take-off point in the map's frame, NaN = not known.
+    """Solves every block, removes links that contradict it, or positions as a whole, and
+    georeferences it by these. `ground_m`: height of the take-off point in the map's frame,
+    NaN = not known.
     """
     plane = {(k.a, k.b): plane_link(k, photos, features) for k in links}
-    solutions, kept = _consistent_blocks(len(photos), plane)
+    start = _start(plane, priors, links, ground_m)
+    position = np.array([p.map_C[:2] @ (1, 1j) for p in priors])
+    usual = np.array([p.sigma_C[0] for p in priors])
+    against = against_positions(list(plane.values()), position, usual)
+    if against and not _fits(start, usual):
+        rest = {key: link for key, link in plane.items() if link not in against}
+        other = _start(rest, priors, links, ground_m)
+        return other if _fits(other, usual) else start
+    return start
+
+
+def _fits(start: Start, sigma: NDArray[np.float64]) -> bool:
+    """Whether positions of these deviations (n,) scatter by no more than `OFF` times as much."""
+    return all(off <= OFF * sigma[i] for i, off in start.sigma_xy.items())
+
+
+def _start(
+    plane: dict[tuple[int, int], PlaneLink],
+    priors: Sequence[Prior],
+    links: Sequence[Link],
+    ground_m: float,
+) -> Start:
+    """`find_start` with links given in the plane as well."""
+    solutions, kept = consistent_blocks(len(priors), plane)
     placed: dict[int, tuple[complex, complex]] = {}
     sigma_xy: dict[int, float] = {}
     georeferenced: set[int] = set()
@@ -210,31 +238,6 @@ def _scaled(block: Sequence[int], priors: Sequence[Prior], start: Start) -> bool
     off = np.abs(told - there)
     wide = np.abs(there - there.mean())
     return bool(np.sqrt((off**2).mean() / len(own)) < FOCAL_SCALE * np.sqrt((wide**2).mean()))
-
-
-def _consistent_blocks(
-    count: int, plane: dict[tuple[int, int], PlaneLink]
-) -> tuple[list[PlaneSolution], set[tuple[int, int]]]:
-    """Solutions of the blocks, and the links that agree with them within a tenth of the flying
-    height.
-    """
-    kept = set(plane)
-    solutions: list[PlaneSolution] = []
-    for _ in range(4):
-        links = [plane[key] for key in sorted(kept)]
-        groups = [g for g in components(count, links) if len(g) >= 2]
-        solutions, bad = [], set()
-        for members in groups:
-            inside = set(members.tolist())
-            own = [k for k in links if k.a in inside]
-            solution = solve_block(members, own)
-            limit = max(0.1, 4 * float(np.median(solution.link_error)))
-            bad |= {(k.a, k.b) for k, e in zip(own, solution.link_error, strict=True) if e > limit}
-            solutions.append(solution)
-        if not bad:
-            break
-        kept -= bad
-    return solutions, kept
 
 
 def georeference(
