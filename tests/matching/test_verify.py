@@ -30,15 +30,16 @@ def view_pair(
     height=(1.0, 1.0),
     noise=0.4,
     tilt=2.0,
+    steep=0.0,
 ):
-    """Observations of rolling ground by two tilted cameras; returns pixels of both and which
-    matches are right.
+    """Observations of rolling ground, that rises by `steep` towards a ridge, by two tilted cameras;
+    returns pixels of both and which matches are right.
     """
     rng = np.random.default_rng(seed)
     C = np.array([[0, 0, FLYING * height[0]], [*base, FLYING * height[1]]])
     R = [cam_R_map_from_angles(y, *rng.normal(0, tilt, 2)) for y in yaw]
     X = rng.uniform(-40, 60, (6000, 2))
-    X = np.column_stack([X, ground(X)])
+    X = np.column_stack([X, ground(X) - steep * abs(X[:, 0] - 10)])
     px = [seen_by(R[k], C[k], LENS, X) for k in range(2)]
     both = np.flatnonzero(
         np.all([(p > 0).all(1) & (p < (WIDTH, HEIGHT)).all(1) for p in px], axis=0)
@@ -192,3 +193,13 @@ def test_rows_that_look_alike_are_no_link_by_chance():
         link = verified(pa, pb, others=900)
         assert isinstance(link, Link), (seed, link.reason)
         assert right[link.index_a].sum() > 40
+
+
+def test_few_matches_over_steep_ground_are_a_link():
+    """No similarity fits all of them, and no homography either, but one epipolar geometry does."""
+    pairs = [
+        view_pair(seed, count=100, outliers=0.1, base=(24.0, 12.0), steep=1.0)[:2]
+        for seed in range(20)
+    ]
+    assert sum(bool(verified(*px, others=1500)) for px in pairs) > 15
+    assert sum(bool(verified(*px, others=1500, one_view=1.1)) for px in pairs) < 5
