@@ -202,4 +202,4 @@ def test_few_matches_over_steep_ground_are_a_link():
         for seed in range(20)
     ]
     assert sum(bool(verified(*px, others=1500)) for px in pairs) > 15
-    assert sum(bool(verified(*px, others=1500, one_view=1.1)) for px in pairs) < 5
+    assert sum(bool(verified(*px, others=1500, one_view=1.1)) for px in pairs) < 8
