@@ -145,13 +145,13 @@ def open_picture(path: Path) -> Source | RejectedPhoto:
     if isinstance(photo, RejectedPhoto):
         return photo
     try:
-        return _of_photo(photo)
+        return of_photo(photo, read_color(photo))
     except (UnreadablePhotoError, OSError) as error:
         return RejectedPhoto(name=path.name, reason=str(error))
 
 
-def _of_photo(photo: Photo) -> Source:
-    values = read_color(photo)
+def of_photo(photo: Photo, values: NDArray[Any]) -> Source:
+    """A photo that was read, by its pixels (h, w[, bands]) as `read_color` gives them."""
     if values.ndim == 3 and values.shape[2] not in (1, 3):
         values = values[..., :3] if values.shape[2] > 3 else values[..., 0]
     values = values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values

@@ -5,7 +5,7 @@ bands compares pixels that were exposed together. Where a band's frame does not 
 saturated, it takes the capture that shows the place from most above.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,7 +20,6 @@ from skyquilt.engine.clock import Steps
 from skyquilt.engine.folder import STATE
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.workers import Workers
-from skyquilt.errors import PhotoFailedError
 from skyquilt.imaging.nodes import STEP, View
 from skyquilt.imaging.views import make_views, native_gsd
 from skyquilt.model.photo import Photo
@@ -34,7 +33,6 @@ from skyquilt.ortho.compose import Composer
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.labels import Labels
 from skyquilt.ortho.orthomosaic import keeper
-from skyquilt.photos.pixels import lost
 from skyquilt.raster import Block, CogWriter, RasterSpec
 from skyquilt.workflows.photo_features import pixels_again
 from skyquilt.workflows.second_camera import pose_beside
@@ -62,9 +60,9 @@ class PlacedBand:
     detail: float | None = None
     """Fine detail of its files over that of the middle one of all bands; None: not known."""
 
-    def without(self, name: str) -> "PlacedBand":
-        """The band without a file that cannot be read."""
-        kept = {i: j for i, j in self.of_photo.items() if self.files.photos[j].name != name}
+    def without(self, names: Container[str]) -> "PlacedBand":
+        """The band without files that cannot be read."""
+        kept = {i: j for i, j in self.of_photo.items() if self.files.photos[j].name not in names}
         return replace(self, of_photo=kept)
 
 
@@ -292,6 +290,4 @@ def _pixels(photo: Photo) -> NDArray[Any]:
         PhotoFailedError: it cannot be read any more.
     """
     pixels = pixels_again(photo)
-    if reason := lost(photo):
-        raise PhotoFailedError(photo.name, reason)
     return np.asarray(pixels[..., 0] if pixels.ndim == 3 else pixels)

@@ -74,12 +74,14 @@ def place_bands(scene: Scene, others: Sequence[Photo], workers: Workers) -> Step
     own = bands_of_files([p for i, p in enumerate(aligned.photos) if i in poses and p.shows_a_band])
     found = bands_of_files(others)
     recorded = yield from _recorded([*own, *found], workers)
-    placed = [PlacedBand(files=b, of_photo=_own_files(aligned, b)) for b in own]
+    # one that is gone tells nothing of its counts: all values would be as weak
+    gone = {p.name: r.reason for b in own for p in b.photos if (r := recorded[p.name]).gone}
+    placed = [PlacedBand(files=b, of_photo=_own_files(aligned, b)).without(gone) for b in own]
     known_tags = {p.name: t for b in own for p, t in zip(b.photos, b.tags, strict=True)}
     velocities = velocities_of(aligned.photos, aligned.alignment)
     captures = [(known_tags.get(p.name) or tags_of(p)).capture for p in aligned.photos]
     refused: dict[str, str] = {}
-    lost: list[RejectedPhoto] = []
+    lost = [RejectedPhoto(name=name, reason=why) for name, why in gone.items()]
     for done, band in enumerate(found):
         yield done, len(found), f"camera of {band.name}"
         useless = {p.name: why for p in band.photos if (why := recorded[p.name].reason)}

@@ -40,6 +40,9 @@ from skyquilt.workflows.mosaic import FinishedMap, make_map
 from skyquilt.workflows.run_report import write_figures
 from skyquilt.workflows.survey_input import Source, SurveyInput, read_input
 
+_LOST = "none of its files can be read any more"
+"""Why a band is not drawn whose files were lost meanwhile."""
+
 
 def iter_bands(
     folder: Source | str,
@@ -113,12 +116,16 @@ def _bands(made: FinishedMap, others: Sequence[Photo]) -> Generator[Event, None,
     yield from (Note(text=t, warning=True) for t in (*placed.notes, *told_left_out(placed.lost)))
     yield from [placed.panel] if placed.panel else []
     bands, lost, made_files = yield from _drawn(made, scene, placed, clock, key)
+    shown = {b.files.name for b in bands}
+    empty = {b.files.name: _LOST for b in placed.bands if b.files.name not in shown}
+    yield from (Note(text=f"The band {n} is left out: {_LOST}.", warning=True) for n in empty)
     for name in {*ADDED} - {*made_files, THERMAL_FILE}:  # of an earlier run with other bands
         remove_file(output / name)
     files = stamps(output, made_files)
     told = band_figures(bands, placed, lost)
     final = placed.final and len(lost) == len(placed.lost)
-    figures = {"bands": told | {"key": key if final else "", "files": files}}
+    told |= {"refused": told["refused"] | empty, "key": key if final else "", "files": files}
+    figures = {"bands": told}
     metrics = {**made.result.metrics, **figures}
     write_section(output, figures["bands"])
     write_figures(output, metrics)
@@ -131,21 +138,22 @@ def _drawn(
     """Draws the rasters: the bands they show, what was left out, and the names of the files; none
     where no band has a place.
     """
-    output, bands, lost = made.result.output, placed.bands, placed.lost
-    if not bands:
-        yield Note(text=f"No band lies on the map, so there is no {BANDS_FILE}.", warning=True)
-        return [], lost, []
-    while True:
+    output, lost = made.result.output, placed.lost
+    bands = [b for b in placed.bands if b.of_photo]
+    while bands:
         drawing = _drawing(made, scene, bands, placed.kind, clock, key)
         try:
             yield from clock.stage("bands", drawing.blocks(clock.workers), keeps=False)
-            break
         except PhotoFailedError as error:
-            bands = [b.without(error.photo) for b in bands]
+            left = (b.without({error.photo}) for b in bands)
+            bands = [b for b in left if b.of_photo]
             lost = [*lost, RejectedPhoto(name=error.photo, reason=error.reason)]
             yield Note(text=f"{error.photo} is left out: {error.reason}", warning=True)
-    files = [BANDS_FILE, *(f"{index.name}.tif" for index in drawing.indices)]
-    return bands, lost, files + ([INFRARED_FILE] if write_infrared(output) else [])
+            continue
+        files = [BANDS_FILE, *(f"{index.name}.tif" for index in drawing.indices)]
+        return bands, lost, files + ([INFRARED_FILE] if write_infrared(output) else [])
+    yield Note(text=f"No band lies on the map, so there is no {BANDS_FILE}.", warning=True)
+    return [], lost, []
 
 
 def _key(made: FinishedMap, scene: Scene, others: Sequence[Photo]) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.coregistration.heights import AlignHeights
+from skyquilt.errors import PhotoFailedError
 from skyquilt.model.raster import Grid
 from skyquilt.model.registration import Matrix, RefusedRegistration, Registration
 from skyquilt.model.surface import HeightField
@@ -54,7 +55,11 @@ def finer(
 def _heights(scene: Scene, dense: Dense) -> HeightField | None:
     held = set(scene.aligned.alignment.held)
     views = [v for v in scene.ground.views if v.photo in held and v.pose.cam_H_map is None]
-    return dense(scene.ground.surface, views, scene.ground.grid, scene.aligned.grey)
+    while True:
+        try:
+            return dense(scene.ground.surface, views, scene.ground.grid, scene.aligned.grey)
+        except PhotoFailedError as error:  # both maps are drawn: it tells no heights any more
+            views = [v for v in views if scene.aligned.photos[v.photo].name != error.photo]
 
 
 def _metres_of_px(grid: Grid) -> Matrix:

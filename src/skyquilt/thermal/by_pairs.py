@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from skyquilt.coregistration.methods import near_guess, registration_method
 from skyquilt.coregistration.propagation import PairPoints, Propagate
 from skyquilt.coregistration.refine_registration import RefineRegistration
+from skyquilt.errors import PhotoFailedError
 from skyquilt.geometry.transforms import fit, transfer
 from skyquilt.imaging.nodes import View
 from skyquilt.imaging.views import on_ground
@@ -160,10 +161,13 @@ def _as_they_are(
     visual: Scene, thermal: Scene, a: tuple[View, Matrix], b: tuple[View, Matrix]
 ) -> PairPoints | None:
     """Points of two photos in their own pixels; None if they cannot be registered."""
-    pictures = [
-        Picture(values=np.ascontiguousarray(s.aligned.pixels(v.photo)))
-        for s, v in ((visual, a[0]), (thermal, b[0]))
-    ]
+    try:
+        pictures = [
+            Picture(values=np.ascontiguousarray(s.aligned.pixels(v.photo)))
+            for s, v in ((visual, a[0]), (thermal, b[0]))
+        ]
+    except PhotoFailedError:  # both maps are drawn: it is lost for this pair alone
+        return None
     ours, theirs = visual.ground.grid, thermal.ground.grid
     shift = _shift(visual, thermal)
     corners = np.array([[0.0, 0], [ours.width, 0], [0, ours.height], [ours.width, ours.height]])
@@ -219,7 +223,10 @@ def _registered(
     grid_a = replace(
         grid_b, west=grid_b.west + float(shift[0]), north=grid_b.north + float(shift[1])
     )
-    flat = _flat(visual, a, grid_a), _flat(thermal, b, grid_b)
+    try:
+        flat = _flat(visual, a, grid_a), _flat(thermal, b, grid_b)
+    except PhotoFailedError:  # both maps are drawn: it is lost for this pair alone
+        return None
     if any(p.valid is None or p.valid.mean() < 0.1 for p in flat):
         return None
     guess = Guess(

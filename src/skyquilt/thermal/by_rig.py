@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from skyquilt.alignment.motion import velocities_of
 from skyquilt.coregistration.band_rig import FindBandRig
 from skyquilt.coregistration.beside import Beside
-from skyquilt.coregistration.pictures import guess_of, open_picture
+from skyquilt.coregistration.pictures import guess_of, of_photo
 from skyquilt.coregistration.rig import FindRig, Rig, RigPair
 from skyquilt.coregistration.workflow import outcome_of
 from skyquilt.errors import PhotoFailedError
@@ -33,8 +33,6 @@ from skyquilt.ortho.exposure import NEUTRAL, Exposure
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.radiometry import DriftMethod, balances_drift, drift_of, value_tags
 from skyquilt.photos.left_out import told_left_out, without_partner
-from skyquilt.photos.pixels import read_color
-from skyquilt.photos.read import rejected
 from skyquilt.photos.together import late_by, taken_together
 from skyquilt.raster import CogWriter, RasterSpec
 from skyquilt.settings import PictureSettings
@@ -241,9 +239,9 @@ def _undecodable(photo: Photo) -> RejectedPhoto | None:
     they are drawn.
     """
     try:
-        read_color(photo)
-    except Exception as error:  # whatever it is, it concerns this photo alone
-        return rejected(photo.name, error)
+        pixels_again(photo)
+    except PhotoFailedError as error:
+        return RejectedPhoto(name=photo.name, reason=error.reason)
     return None
 
 
@@ -258,10 +256,12 @@ def _registered(
     scene: Scene, index: int, thermal: Photo, velocity: NDArray[np.float64]
 ) -> RigPair | None:
     """Correspondences over the overlap of two photos taken at the same time; None if they cannot be
-    registered.
+    registered, or one of them cannot be read any more.
     """
-    a, b = open_picture(scene.aligned.photos[index].path), open_picture(thermal.path)
-    if isinstance(a, RejectedPhoto) or isinstance(b, RejectedPhoto):
+    try:
+        a = of_photo(scene.aligned.photos[index], scene.aligned.pixels(index))
+        b = of_photo(thermal, pixels_again(thermal))
+    except PhotoFailedError:  # told when it is drawn; the visual map shows its own already
         return None
     outcome = outcome_of(a, b, "auto", guess_of(a, b))
     if not isinstance(outcome, Registration):

@@ -35,6 +35,7 @@ from skyquilt.model.photo import RejectedPhoto, Survey
 from skyquilt.model.registration import RefusedRegistration, Registration
 from skyquilt.ortho.radiometry import recorded_tags, value_figures
 from skyquilt.photos.guesses import as_thermal
+from skyquilt.photos.pixels import lost
 from skyquilt.photos.survey import survey_notes
 from skyquilt.photos.together import taken_together
 from skyquilt.settings import DEFAULTS, MosaicSettings, PictureSettings
@@ -268,6 +269,9 @@ def _by_rig(
     found = rigged(scene, thermal.photos)
     if isinstance(found, RefusedRegistration):
         return found
+    left = {r.name for r in found.rejected}
+    if any(lost(p) for p in thermal.photos if p.name in left):
+        key = ""  # with all files it is another map
     yield from (Note(text=text) for text in thermal.notes)
     yield from rig_notes(found)
     output, metrics = visual.result.output, visual.result.metrics
@@ -277,7 +281,7 @@ def _by_rig(
             draw_rigged(output / THERMAL_FILE, found, scene, visual.methods.blend, exposure)
             break
         except PhotoFailedError as error:
-            found, key = found.without(error), ""  # with all files it is another map
+            found, key = found.without(error), ""
             yield Note(text=f"{error.photo} is left out: {error.reason}", warning=True)
         if len(found.alignment.poses) < FindRig.minimum:
             return RefusedRegistration(

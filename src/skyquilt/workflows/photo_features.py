@@ -243,13 +243,19 @@ def pixels_again(photo: Photo) -> NDArray[Any]:
     """Pixels of a photo that could be decoded before.
 
     Raises:
-        PhotoFailedError: it cannot be any more.
+        PhotoFailedError: it cannot be any more, or its file holds another photo.
+        MemoryError: there is not enough memory.
     """
     try:
-        return read_color(photo)
+        pixels = read_color(photo)
     except Exception as error:  # whatever it is, it concerns this photo alone
+        if out_of_memory(error):
+            raise MemoryError(f"it does not suffice to decode {photo.name}") from error
         reason = lost(photo) or rejected(photo.name, error).reason
         raise PhotoFailedError(photo.name, reason) from error
+    if reason := lost(photo):
+        raise PhotoFailedError(photo.name, reason)
+    return pixels
 
 
 def features_key(photo: Photo, detector: Detector) -> str:

@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 from skyquilt.coregistration.band_rig import BandRig
 from skyquilt.coregistration.beside import Together
 from skyquilt.coregistration.rig import Rig
+from skyquilt.errors import PhotoFailedError
 from skyquilt.imaging.grey import shrink, to_grey8
 from skyquilt.imaging.nodes import View
 from skyquilt.imaging.views import on_ground
 from skyquilt.model.photo import Photo, evenly
 from skyquilt.model.poses import Pose
-from skyquilt.photos.pixels import read_color
 from skyquilt.workflows.flow import Scene
+from skyquilt.workflows.photo_features import pixels_again
 
 LONGEST = 1600
 """Longest side in px of the pictures that are compared."""
@@ -77,23 +78,24 @@ def seen_together(
 def _together(
     scene: Scene, index: int, other: Photo, velocity: NDArray[np.float64], coloured: bool
 ) -> Together | None:
-    """Pictures of one capture; None where its file cannot be read."""
+    """Pictures of one capture; None where a file of it cannot be read any more."""
     aligned = scene.aligned
     kind = aligned.photos[index].channels, aligned.photos[index].dtype
+    coloured = coloured and kind == (3, "uint8")
     try:
-        grey = to_grey8(read_color(other))
-    except Exception:  # whatever it is, it concerns this photo alone; told when it is drawn
+        theirs = shrink(to_grey8(pixels_again(other)), LONGEST)[0]
+        ours = aligned.grey(index, LONGEST)
+        colours = shrink(aligned.pixels(index), LONGEST)[0] if coloured else None
+    except PhotoFailedError:  # told when it is drawn; the map shows its own already
         return None
     camera = aligned.alignment.camera(index)
     return Together(
-        a=aligned.grey(index, LONGEST),
+        a=ours,
         camera_a=camera,
-        b=shrink(grey, LONGEST)[0],
+        b=theirs,
         nearness=_nearness(scene, index),
         velocity=aligned.alignment.poses[index].cam_R_map @ velocity,
-        colours=shrink(aligned.pixels(index), LONGEST)[0]
-        if coloured and kind == (3, "uint8")
-        else None,
+        colours=colours,
     )
 
 
