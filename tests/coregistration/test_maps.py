@@ -1,5 +1,6 @@
 """Maps as other programs write them: types, missing data, places; against distortions made here."""
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from skyquilt.errors import SideFileError
 from skyquilt.geometry.frames import cam_R_map_from_angles
 from skyquilt.geometry.transforms import transfer
 from skyquilt.model.event import StageStarted
-from skyquilt.model.photo import Attitude, Photo
+from skyquilt.model.photo import Attitude, Photo, RejectedPhoto
 from skyquilt.model.registration import ErrorField, Picture, Registration
 from skyquilt.raster.read_map import MapFile
 from tests.coregistration.scenes import error, layout, pair, spectrum, turned
@@ -451,6 +452,22 @@ def test_a_photo_of_a_tenth_of_a_map_is_found(tmp_path):
     px = np.array([[420, 610, 1], [460, 580, 1], [400, 650, 1.0]])
     there, right = px @ found.b_H_a.T, px @ truth.T
     assert np.abs(there[:, :2] / there[:, 2:] - right[:, :2]).max() < 0.8
+
+
+def test_a_map_whose_name_is_no_text_is_refused_for_it(scene, tmp_path):
+    """GDAL cannot be asked for it. It was registered as a photo, without its place and a word."""
+    _, b = scene
+    named = tmp_path / os.fsdecode(b"b\xff.tif")
+    plain = tmp_path / os.fsdecode(b"plain\xff.tif")
+    try:
+        write(tmp_path / "b.tif", b, place_b()).rename(named)
+    except OSError:
+        pytest.skip("this file system wants names to be text")
+    found = open_picture(named)
+    assert isinstance(found, RejectedPhoto) and "no UTF-8 text; rename it" in found.reason
+    cv2.imwrite(str(tmp_path / "plain.tif"), b)
+    (tmp_path / "plain.tif").rename(plain)
+    assert open_picture(plain).photo is not None
 
 
 def test_a_map_that_is_damaged_or_gone_at_full_size_is_told(scene, tmp_path):

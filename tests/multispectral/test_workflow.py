@@ -168,13 +168,20 @@ def test_photos_in_colours_are_the_map_where_there_are_any(flown, bare, tmp_path
 
 def test_a_lost_file_and_a_band_of_other_ground_are_left_out(bare, tmp_path, monkeypatch):
     shutil.copytree(bare, tmp_path / "photos")
+    """A file of the map's own band, too, without which all values were raw counts."""
     gone, drawing = tmp_path / "photos" / "SIM_0005_MS_NIR.TIF", workflow._drawing
+    own, sorted_out = tmp_path / "photos" / "SIM_0002_MS_G.TIF", placing.bands_of_files
 
     def drawn(*arguments):
         gone.unlink(missing_ok=True)
         return drawing(*arguments)
 
+    def begun(*arguments):
+        own.unlink(missing_ok=True)
+        return sorted_out(*arguments)
+
     monkeypatch.setattr(workflow, "_drawing", drawn)
+    monkeypatch.setattr(placing, "bands_of_files", begun)
     for seed, path in enumerate(sorted((tmp_path / "photos").glob("*_MS_B.TIF"))):
         raw = bytearray(path.read_bytes())
         noise = np.random.default_rng(seed).integers(4000, 9000, 480 * 360, dtype=np.uint16)
@@ -186,8 +193,9 @@ def test_a_lost_file_and_a_band_of_other_ground_are_left_out(bare, tmp_path, mon
     assert list(told["refused"]) == ["blue"]
     assert any("The band blue is left out" in text for text in texts)
     assert [b["name"] for b in told["shown"]] == ["green", "red", "red edge", "nir"]
-    assert [b["photos"] for b in told["shown"]] == [9, 9, 9, 8]
-    assert told["photos_rejected"] == {"SIM_0005_MS_NIR.TIF": "its file is gone"}
+    assert [b["photos"] for b in told["shown"]] == [8, 9, 9, 8] and told["values"] == "relative"
+    assert told["photos_rejected"] == dict.fromkeys((own.name, gone.name), "its file is gone")
+    assert f"{own.name} is left out: its file is gone" in texts and not told["key"]
     assert "SIM_0005_MS_NIR.TIF is left out: its file is gone" in texts
 
 

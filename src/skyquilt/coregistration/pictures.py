@@ -20,6 +20,7 @@ from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.registration import Guess, Matrix, Picture
 from skyquilt.photos.pixels import read_color
 from skyquilt.photos.read import read_photo
+from skyquilt.raster.drivers import NO_TEXT, is_text
 from skyquilt.raster.read_map import MapFile, open_map, read_part, read_window
 
 _EARTH_M = 6378137.0
@@ -144,6 +145,8 @@ def open_picture(path: Path) -> Source | RejectedPhoto:
     assert photo is not None
     if isinstance(photo, RejectedPhoto):
         return photo
+    if photo.placed and not is_text(path):
+        return RejectedPhoto(name=path.name, reason=NO_TEXT)  # GDAL alone could tell its place
     try:
         return of_photo(photo, read_color(photo))
     except (UnreadablePhotoError, OSError) as error:

@@ -15,8 +15,10 @@ GEOTIFF = "GTiff"
 """The format of all rasters of a run, and of terrain."""
 MAPS = (GEOTIFF, "MBTiles", "PNG", "JPEG", "JP2OpenJPEG", "WEBP", "BMP", "HFA", "ENVI", "AAIGrid")
 """Formats of maps that users bring along."""
+NO_TEXT = "a file or folder on its path has a name that is no UTF-8 text; rename it"
+"""Why a map cannot be read that GDAL cannot be asked for."""
 _NO_TEXT = "name that is no text"
-"""Said of a path that GDAL cannot be given."""
+"""Said of its path."""
 
 
 def why_unreadable(error: Exception) -> str:
@@ -27,7 +29,7 @@ def why_unreadable(error: Exception) -> str:
     if "not recognized" in told:
         return "it is no raster, or its beginning is damaged"
     if _NO_TEXT in told:
-        return "a file or folder on its path has a name that is no UTF-8 text; rename it"
+        return NO_TEXT
     if "No such file" in told:
         return "it does not exist"
     return "it is damaged, or a copy that was cut off"
@@ -46,7 +48,7 @@ def open_raster(path: Path, **options: Any) -> "DatasetReader":
             pass  # GDAL would wait for the other end of a pipe
     except OSError as error:
         raise rasterio.errors.RasterioIOError(f"{path}: {error.strerror}") from error
-    if not _is_text(path):
+    if not is_text(path):
         raise rasterio.errors.RasterioIOError(f"{path}: {_NO_TEXT}")
     for driver in MAPS:
         try:
@@ -56,7 +58,7 @@ def open_raster(path: Path, **options: Any) -> "DatasetReader":
     raise last
 
 
-def _is_text(path: Path) -> bool:
+def is_text(path: Path) -> bool:
     """Whether a path is text, as GDAL wants it; on Linux a name may be any bytes."""
     try:
         str(path).encode()
