@@ -12,6 +12,7 @@ import tifffile
 
 from skyquilt.engine.clock import Clock
 from skyquilt.engine.store import Store
+from skyquilt.engine.workers import Threads
 from skyquilt.errors import PhotoFailedError
 from skyquilt.geometry.camera import Camera
 from skyquilt.model.event import Note
@@ -124,7 +125,9 @@ def test_a_band_without_files_is_not_drawn(frame, monkeypatch):
 
     monkeypatch.setattr(workflow, "_drawing", lambda *_: SimpleNamespace(blocks=blocks))
     clock = Clock(
-        store=Store(folder=frame.path.parent, registry=REGISTRY), began=Clock.now(), workers=None
+        store=Store(folder=frame.path.parent, registry=REGISTRY),
+        began=Clock.now(),
+        workers=Threads(1),
     )
     made = SimpleNamespace(result=SimpleNamespace(output=frame.path.parent))
     steps, told = workflow._drawn(made, None, placed, clock, ""), []
