@@ -160,8 +160,24 @@ def test_weak_links_contradict_positions(seed):
     assert against_positions(links[:-3], position, sigma) == []
     strong, _ = lines_and_false_links(seed, 3, weight=90.0)
     assert against_positions(strong, position, sigma) == []
-    assert against_positions(links[5:], position, sigma) == links[-3:]
+    fewer = [links[k] for k in (0, 2, 4, 6, 8, 10, 11, 12, 13, 14)]  # their photos have others
+    assert against_positions(fewer, position, sigma) == links[-3:]
     assert against_positions(links[7:], position, sigma) == []
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_all_links_of_a_photo_do_not_contradict_its_position(seed, monkeypatch):
+    """It is the position that is wrong, by 90 m: the photo stays where weak links put it."""
+    monkeypatch.setattr(start, "plane_link", lambda link, photos, features: link)
+    a, t = plane(seed)
+    rng = np.random.default_rng(seed)
+    links = links_of(a, t, rng, weight=40.0)
+    position = t + rng.normal(size=len(t)) + 1j * rng.normal(size=len(t))
+    position[9] += 90
+    assert against_positions(links, position, np.full(len(t), 1.0)) == []
+    found = start.find_start([], priors_at(position, sigma=1.0), [], links)
+    assert found.blocks == (tuple(range(24)),)
+    assert abs(found.placed[9][1] - t[9]) < 15
 
 
 @pytest.mark.parametrize("seed", range(3))

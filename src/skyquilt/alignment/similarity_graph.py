@@ -217,7 +217,8 @@ def against_positions(
 ) -> list[PlaneLink]:
     """Links by which two photos lie clearly nearer to each other or further apart than by their
     positions (n,) in m with deviations (n,), NaN where unknown; most links tell the scale. None
-    where they are many or strong: then positions are wrong.
+    where they are many or strong: then positions are wrong; nor those of a photo that has no other
+    links: its own position is.
     """
     apart = np.array([abs(position[k.b] - position[k.a]) for k in links])
     moved = np.array([abs(k.p_a - k.p_b / k.b_S_a) for k in links])
@@ -227,9 +228,12 @@ def against_positions(
     height = float(np.median(apart[told] / moved[told]))
     error = np.array([np.hypot(sigma[k.a], sigma[k.b]) for k in links])
     far = np.abs(height * moved - apart) > np.maximum(AGAINST * error, TILTED * height)
-    found = [k for k, contradicts in zip(links, far.tolist(), strict=True) if contradicts]
+    found = [k for k, against in zip(links, far.tolist(), strict=True) if against]
     many = len(found) >= MOST_AGAINST * len(links) or any(k.weight >= WEAK for k in found)
-    return [] if many else found
+    if many:
+        return []
+    held = {end for k, c in zip(links, far.tolist(), strict=True) if not c for end in (k.a, k.b)}
+    return [k for k in found if k.a in held and k.b in held]
 
 
 def fit_similarity(
