@@ -556,6 +556,18 @@ def test_camera_aimed_at_the_horizon_by_pose(mosaic, photos):
     assert low < max(width, height) < 2 * reach + 150  # the centres lie within 150 m
 
 
+def test_photos_that_show_no_ground_within_the_largest_angle_have_a_reason(mosaic, photos):
+    level = named(photos)[3:5]
+    for path in level:
+        text = path.read_bytes().replace(b'GimbalPitchDegree="-9', b'GimbalPitchDegree="-0')
+        path.write_bytes(text.replace(b'GimbalPitchDegree="-8', b'GimbalPitchDegree="-0'))
+    told = mosaic(photos, "--method", "pose", "--max-view-angle", "40").made()
+    reasons = told.metrics["photos_rejected"]
+    assert reasons.keys() == {path.name for path in level}
+    assert all("40 degrees from the vertical" in why for why in reasons.values())
+    assert told.metrics["photos_used"] == 7
+
+
 # no metadata at all
 
 

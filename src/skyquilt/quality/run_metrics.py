@@ -160,6 +160,16 @@ def accuracy_figures(
     }
 
 
+def _unseen(photos: Sequence[Photo], alignment: Alignment, ground: Ground) -> dict[str, str]:
+    """Why placed photos have no part in the map, by name: those without a view."""
+    seen = {v.photo for v in ground.views}
+    why = (
+        "it could be placed, but shows no ground of known height at less than"
+        f" {ground.limits.angle_deg:g} degrees from the vertical (--max-view-angle)"
+    )
+    return {photos[i].name: why for i in sorted(alignment.poses.keys() - seen)}
+
+
 def figures(
     *,
     photos: Sequence[Photo],
@@ -185,7 +195,8 @@ def figures(
         "why": alignment.why,
         "photos_total": total,
         "photos_used": len(ground.views),
-        "photos_rejected": {r.name: r.reason for r in rejected},
+        "photos_rejected": {r.name: r.reason for r in rejected}
+        | _unseen(photos, alignment, ground),
         "gsd_m": ground.grid.gsd,
         "native_gsd_m": _round(ground.native_gsd, 5),
         "crs": alignment.frame.crs,
