@@ -163,6 +163,8 @@ def test_weak_links_contradict_positions(seed):
     fewer = [links[k] for k in (0, 2, 4, 6, 8, 10, 11, 12, 13, 14)]  # their photos have others
     assert against_positions(fewer, position, sigma) == links[-3:]
     assert against_positions(links[7:], position, sigma) == []
+    more, _ = lines_and_false_links(seed, 4)  # so many would not agree by chance
+    assert against_positions(more, position, sigma) == []
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -7,6 +7,7 @@ are averaged first, and translations are estimated afterwards (B/C of the method
 added last, with a robust fit.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -30,6 +31,8 @@ height than tilts of eight degrees move a picture by.
 """
 WEAK, MOST_AGAINST = 80, 1 / 3
 """False links are weaker than so many matches, and fewer than this share of all."""
+TOGETHER = 4
+"""So many that join the same two parts are none of chance."""
 Complex = NDArray[np.complex128]
 Index = NDArray[np.int64]
 Array = NDArray[np.float64]
@@ -218,7 +221,8 @@ def against_positions(
     """Links by which two photos lie clearly nearer to each other or further apart than by their
     positions (n,) in m with deviations (n,), NaN where unknown; most links tell the scale. None
     where they are many or strong: then positions are wrong; nor those of a photo that has no other
-    links: its own position is.
+    links: its own position is; nor several that join the same two parts: those of an axis that lies
+    beside the middle of the pictures seem displaced.
     """
     apart = np.array([abs(position[k.b] - position[k.a]) for k in links])
     moved = np.array([abs(k.p_a - k.p_b / k.b_S_a) for k in links])
@@ -232,8 +236,18 @@ def against_positions(
     many = len(found) >= MOST_AGAINST * len(links) or any(k.weight >= WEAK for k in found)
     if many:
         return []
-    held = {end for k, c in zip(links, far.tolist(), strict=True) if not c for end in (k.a, k.b)}
-    return [k for k in found if k.a in held and k.b in held]
+    rest = [k for k, against in zip(links, far.tolist(), strict=True) if not against]
+    part = connected(
+        len(position), np.array([k.a for k in rest], int), np.array([k.b for k in rest], int)
+    )
+    held = {end for k in rest for end in (k.a, k.b)}
+    joined = Counter(frozenset((part[k.a], part[k.b])) for k in found)
+
+    def alone(k: PlaneLink) -> bool:
+        parts = frozenset((part[k.a], part[k.b]))
+        return len(parts) == 1 or joined[parts] < TOGETHER
+
+    return [k for k in found if k.a in held and k.b in held and alone(k)]
 
 
 def fit_similarity(
