@@ -128,14 +128,16 @@ def find_start(
     """
     plane = {(k.a, k.b): plane_link(k, photos, features) for k in links}
     start = _start(plane, priors, links, ground_m)
-    position = np.array([p.map_C[:2] @ (1, 1j) for p in priors])
     usual = np.array([p.sigma_C[0] for p in priors])
-    against = against_positions(list(plane.values()), position, usual)
-    if against and not _fits(start, usual):
-        rest = {key: link for key, link in plane.items() if link not in against}
-        other = _start(rest, priors, links, ground_m)
-        return other if _fits(other, usual) else start
-    return start
+    if _fits(start, usual):
+        return start
+    position = np.array([p.map_C[:2] @ (1, 1j) for p in priors])
+    against = {(k.a, k.b) for k in against_positions(list(plane.values()), position, usual)}
+    if not against:
+        return start
+    rest = {key: link for key, link in plane.items() if key not in against}
+    other = _start(rest, priors, links, ground_m)
+    return other if _fits(other, usual) else start
 
 
 def _fits(start: Start, sigma: NDArray[np.float64]) -> bool:

@@ -17,8 +17,6 @@ MAPS = (GEOTIFF, "MBTiles", "PNG", "JPEG", "JP2OpenJPEG", "WEBP", "BMP", "HFA", 
 """Formats of maps that users bring along."""
 NO_TEXT = "a file or folder on its path has a name that is no UTF-8 text; rename it"
 """Why a map cannot be read that GDAL cannot be asked for."""
-_NO_TEXT = "name that is no text"
-"""Said of its path."""
 
 
 def why_unreadable(error: Exception) -> str:
@@ -28,7 +26,7 @@ def why_unreadable(error: Exception) -> str:
     told = str(error)
     if "not recognized" in told:
         return "it is no raster, or its beginning is damaged"
-    if _NO_TEXT in told:
+    if NO_TEXT in told:
         return NO_TEXT
     if "No such file" in told:
         return "it does not exist"
@@ -49,7 +47,7 @@ def open_raster(path: Path, **options: Any) -> "DatasetReader":
     except OSError as error:
         raise rasterio.errors.RasterioIOError(f"{path}: {error.strerror}") from error
     if not is_text(path):
-        raise rasterio.errors.RasterioIOError(f"{path}: {_NO_TEXT}")
+        raise rasterio.errors.RasterioIOError(f"{path}: {NO_TEXT}")
     for driver in MAPS:
         try:
             return rasterio.open(path, driver=driver, **options)

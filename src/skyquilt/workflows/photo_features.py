@@ -231,12 +231,17 @@ def pixels_of(photo: Photo, store: Store) -> NDArray[Any]:
         OutputError: a frame cannot be stored.
     """
     if photo.frame_s is None:
-        pixels = read_color(photo)
-        if reason := lost(photo):
-            raise UnreadablePhotoError(reason)
-        return pixels
+        return _as_it_was(photo)
     body = store.get_or(FRAMES, photo.digest, lambda: kept_frame(read_color(photo)))
     return decode_jpeg(body.tobytes())
+
+
+def _as_it_was(photo: Photo) -> NDArray[Any]:
+    """Pixels of a photo whose file is the one that was read; `UnreadablePhotoError` if not."""
+    pixels = read_color(photo)
+    if reason := lost(photo):
+        raise UnreadablePhotoError(reason)
+    return pixels
 
 
 def pixels_again(photo: Photo) -> NDArray[Any]:
@@ -247,15 +252,12 @@ def pixels_again(photo: Photo) -> NDArray[Any]:
         MemoryError: there is not enough memory.
     """
     try:
-        pixels = read_color(photo)
+        return _as_it_was(photo)
     except Exception as error:  # whatever it is, it concerns this photo alone
         if out_of_memory(error):
             raise MemoryError(f"it does not suffice to decode {photo.name}") from error
         reason = lost(photo) or rejected(photo.name, error).reason
         raise PhotoFailedError(photo.name, reason) from error
-    if reason := lost(photo):
-        raise PhotoFailedError(photo.name, reason)
-    return pixels
 
 
 def features_key(photo: Photo, detector: Detector) -> str:
