@@ -264,6 +264,20 @@ def test_colour_is_brightness(scene):
     )
 
 
+@pytest.mark.parametrize("largest", [1e9, 1e18])
+def test_values_of_any_size_are_registered_alike(scene, largest):
+    """Sums over patches of squares were infinite from 1e17 on: a registration of which nothing was
+    known ended in a traceback.
+    """
+    usual = usable(Picture(values=scene.astype(np.float32)))
+    large = usable(Picture(values=scene.astype(np.float32) * np.float32(largest)))
+    assert np.array_equal(large.valid, usual.valid) and not large.reason
+    assert np.isfinite((large.grey**2).sum(dtype=np.float32))
+    np.testing.assert_allclose(
+        large.grey / large.grey.max(), usual.grey / usual.grey.max(), rtol=1e-5, atol=1e-6
+    )
+
+
 def test_fishers_tail_is_scipys():
     from scipy.stats import chi2
 

@@ -217,6 +217,31 @@ def test_floating_point_colours_are_told_to_be_mapped_as_recorded(tmp_path):
     assert any("1 photos in colour have floating-point" in n for n in read_survey(tmp_path).notes)
 
 
+@pytest.mark.parametrize("fill", [-9999.0, -32768.0, -3.4028235e38, 1e20, np.inf])
+@pytest.mark.parametrize("scale", [0.004, 12.0], ids=["reflectance", "counts"])
+def test_what_programs_fill_gaps_with_is_no_value_although_the_file_does_not_say_so(
+    tmp_path, scale, fill
+):
+    """Shares of light became degrees Celsius, and a picture of counts was grey all over."""
+    values = pixels().astype(np.float32)[..., 0] * np.float32(scale)
+    filled = values.copy()
+    filled[:20, :30] = fill
+    tifffile.imwrite(tmp_path / "f.tif", filled)
+    photo = read_photo(tmp_path / "f.tif")
+    assert (photo.unit, photo.band) == ("", "visible")
+    found = read_color(photo)
+    assert np.isnan(found[:20, :30]).all()
+    assert np.array_equal(found[20:], values[20:]) and np.array_equal(found[:, 30:], values[:, 30:])
+    assert read_gray(photo)[20:].std() > 40  # of pictures without gaps: 70
+
+
+def test_a_low_value_among_lower_ones_is_a_value(tmp_path):
+    values = np.linspace(-30_000, 60_000, 96 * 64).astype(np.float32).reshape(64, 96)
+    values[5, 5] = -9999
+    tifffile.imwrite(tmp_path / "f.tif", values)
+    assert np.array_equal(read_color(read_photo(tmp_path / "f.tif")), values)
+
+
 def test_truncated_tiff(tmp_path):
     tifffile.imwrite(tmp_path / "m.tif", pixels(), photometric="rgb")
     data = (tmp_path / "m.tif").read_bytes()

@@ -39,6 +39,9 @@ measuring camera is that its detector has wrong (dead, hot).
 """
 THICK = 4
 """Side in px of squares without measurements that are no faults of single pixels and lines."""
+LARGEST = 1e6
+"""Largest value as it is: sums over patches of squares of larger ones may exceed single precision.
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -64,7 +67,7 @@ def usable(picture: Picture) -> Usable:
     band = one_band(picture.values)
     finite = np.isfinite(band)
     given = finite if picture.valid is None else finite & picture.valid
-    grey = filled(np.where(finite, band, 0).astype(np.float32), given)
+    grey = _in_reach(filled(np.where(finite, band, 0).astype(np.float32), given))
     if picture.values.dtype != np.uint8 and given.any():
         grey = filled(grey, ~_specks(grey, given))
         given = given | thin(~finite, THICK)
@@ -97,6 +100,12 @@ def filled(grey: NDArray[np.float32], given: NDArray[np.bool_]) -> NDArray[np.fl
     values = np.zeros(label.max() + 1, np.float32)
     values[label[given]] = grey[given]  # each given pixel has a label of its own
     return np.asarray(values[label])
+
+
+def _in_reach(grey: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Values that are too large in another unit; no registration depends on that."""
+    largest = max(abs(float(grey.max())), abs(float(grey.min())))
+    return grey if largest <= LARGEST else grey * np.float32(LARGEST / largest)
 
 
 def _specks(grey: NDArray[np.float32], given: NDArray[np.bool_]) -> NDArray[np.bool_]:

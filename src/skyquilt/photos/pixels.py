@@ -27,6 +27,7 @@ from skyquilt.photos.thermal import (
     thermal_frame_of_jpeg,
     thermal_frame_of_values,
 )
+from skyquilt.raster.fillings import without_fillings
 from skyquilt.video.decoder import frame_of
 
 Pixels = NDArray[Any]
@@ -225,7 +226,8 @@ def read_tiff(
 ) -> Pixels:
     """The page of a TIFF that is the photo as (height, width, bands) without alpha, signed and
     wide types as float32, black and white as 0 and 255, palettes and inks as RGB, pixels that are
-    see-through or hold the value that stands for none as black or NaN; `size`: the width and height
+    see-through or hold the value that stands for none as black or NaN, and so what programs fill
+    real numbers with; `size`: the width and height
     that were checked; `scaled`: by the scale and offset that GDAL's tags state, or where values
     mean kelvins (`stored`), by FLIR's kelvins per count.
     """
@@ -256,8 +258,10 @@ def read_tiff(
         pixels = pixels[..., :1]
     empty = None if void is None else _equal(pixels, void)
     if pixels.dtype not in (np.uint8, np.uint16):
+        real = pixels.dtype.kind == "f"
         with np.errstate(over="ignore"):  # what fills gaps may be larger
             pixels = pixels.astype(np.float32)
+        pixels = without_fillings(pixels) if real else pixels
     pixels = pixels if pixels.ndim == 3 else pixels[..., None]
     if kind == tifffile.PHOTOMETRIC.PALETTE and palette is not None:
         pixels = np.moveaxis(palette[:, pixels[..., 0]] // 257, 0, -1).astype(np.uint8)

@@ -10,15 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.raster.drivers import open_raster, why_unreadable
+from skyquilt.raster.fillings import LARGEST, filling
 from skyquilt.raster.placement import metres_per_unit, placement
 
 if TYPE_CHECKING:
     from rasterio.io import DatasetReader
 
-FILLS = (-9999.0, -10000.0, -32767.0, -32768.0, -99999.0)
-"""Values with which programs fill pixels that have none, often without stating it."""
-LARGEST = 1e30
-"""Values beyond this are fillings, too."""
 MOST_READ = 40_000_000_000
 """Most pixels that are read to reduce them, some minutes; more need overviews."""
 _LOOKED = 1024
@@ -180,7 +177,7 @@ def _masked(raster: "DatasetReader") -> bool:
 
 
 def _nodata(raster: "DatasetReader") -> float | None:
-    """The stated value, or one of `FILLS` that occurs in the first band."""
+    """The stated value, or one of `fillings.FILLS` that occurs in the first band."""
     import rasterio
 
     known = _masked(raster) or np.dtype(raster.dtypes[0]).kind not in "if"
@@ -193,7 +190,7 @@ def _nodata(raster: "DatasetReader") -> float | None:
     except rasterio.errors.RasterioError:
         return None  # told when the pixels are read
     low = float(np.nanmin(seen)) if not np.isnan(seen).all() else 0.0
-    return low if low in FILLS else None
+    return filling(low)
 
 
 def part_between(
