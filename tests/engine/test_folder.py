@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from skyquilt.engine import lock
-from skyquilt.engine.folder import CONTRACT, FILES, PART, STATE, claimed, open_run
+from skyquilt.engine.folder import CONTRACT, FILES, PART, STATE, check_room, claimed, open_run
 from skyquilt.engine.lock import NO_LOCKS
-from skyquilt.errors import OutputError
+from skyquilt.errors import OutputError, RefusedError
 from skyquilt.version import __version__
 
 
@@ -235,3 +235,72 @@ def test_a_killed_command_leaves_nothing_in_the_way(tmp_path):
     with claimed(out, ["a.json"], overwrite=False):
         (out / "a.json").write_text("new")
     assert [p.name for p in out.iterdir()] == ["a.json"]
+
+
+def stopped(out, names, error=KeyboardInterrupt):
+    """A command that is stopped while it writes."""
+    with pytest.raises(error), claimed(out, ["a.json", "b.tif"], overwrite=False, folders=["c"]):
+        for name in names:
+            (out / name).parent.mkdir(exist_ok=True)
+            (out / name).write_text("half")
+        raise error("stopped")
+
+
+def refused(out, names):
+    held = pytest.raises(OutputError, match="already holds files")
+    with held, claimed(out, names, overwrite=False, folders=["c"]):
+        pass
+
+
+@pytest.mark.parametrize("error", [OutputError, KeyboardInterrupt, RuntimeError])
+def test_the_same_command_replaces_what_a_stopped_one_left(tmp_path, error):
+    """It was refused: "already holds files", where the error had said to run it again."""
+    out = tmp_path / "out"
+    stopped(out, ["a.json", "b.tif.partial", "c/1.png", ".probe"], error)
+    with claimed(out, ["a.json", "b.tif"], overwrite=False, folders=["c"]):
+        assert not (out / "a.json").exists() and not (out / "b.tif.partial").exists()
+        (out / "a.json").write_text("whole")
+    assert sorted(p.name for p in out.iterdir()) == ["a.json", "c"]
+    refused(out, ["a.json"])
+
+
+def test_a_killed_command_with_results_is_replaced_too(tmp_path):
+    out = tmp_path / "out"
+    with working(out, "here") as other:
+        other.stdout.readline()
+        (out / "a.json").write_text("half")
+        other.kill()
+    with claimed(out, ["a.json"], overwrite=False):
+        assert not (out / "a.json").exists()
+
+
+def test_files_of_others_beside_those_of_a_stopped_command_are_kept(tmp_path):
+    out = tmp_path / "out"
+    stopped(out, ["a.json"])
+    (out / "notes.txt").write_text("mine")
+    refused(out, ["a.json", "b.tif"])
+    assert (out / "notes.txt").read_text() == "mine"
+
+
+def test_a_refusal_is_a_result(tmp_path):
+    out = tmp_path / "out"
+    stopped(out, ["a.json"], RefusedError)
+    refused(out, ["a.json", "b.tif"])
+
+
+def test_a_stopped_command_that_wrote_nothing_leaves_nothing(tmp_path):
+    stopped(tmp_path / "out", [])
+    assert not any((tmp_path / "out").iterdir())
+
+
+def test_room_is_checked_before_the_work_and_nothing_is_changed(tmp_path):
+    """`plan` told after its routes were found that it may not write them."""
+    out = tmp_path / "out"
+    check_room(out, ["a.json"], overwrite=False)
+    assert not any(out.iterdir())
+    (out / "a.json").write_text("a plan")
+    check_room(out, ["a.json"], overwrite=True)
+    assert (out / "a.json").read_text() == "a plan"
+    for place in (out, out / "a.json", out / "a.json" / "below"):
+        with pytest.raises(OutputError):
+            check_room(place, ["a.json"], overwrite=False)

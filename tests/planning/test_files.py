@@ -12,17 +12,19 @@ import numpy as np
 import pytest
 from shapely import box
 
-from skyquilt.errors import SideFileError
+from skyquilt.errors import OutputError, SideFileError
 from skyquilt.planning.check import check_mission, check_plan
 from skyquilt.planning.exports import WRITERS, parts, write_missions
 from skyquilt.planning.kml import write_kml
 from skyquilt.planning.missions import read_mission
 from skyquilt.planning.plan_file import read_plan, write_plan
 from skyquilt.planning.records import Drone, KeepOut, PicturePoint, Plan, Sortie, Waypoint
+from skyquilt.planning.settings import PlanSettings
 from skyquilt.planning.site import geographic, make_site
 from skyquilt.planning.stops import flights_of
 from skyquilt.planning.terrain import FLAT
 from skyquilt.planning.view import find_view
+from skyquilt.planning.workflow import Order, iter_plan
 
 ZONE = "EPSG:32633"
 VIEW = find_view("FC6310")
@@ -285,3 +287,12 @@ def test_missions_that_are_none_are_one_sentence(tmp_path, name, data, words):
     (tmp_path / name).write_bytes(data)
     with pytest.raises(SideFileError, match=words):
         read_mission(tmp_path / name)
+
+
+def test_a_folder_that_is_taken_is_told_before_the_routes_are_planned(tmp_path):
+    """It took half a minute, and with a long search for routes as long as that."""
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "notes.txt").write_text("mine")
+    order = Order(area=tmp_path / "missing.geojson", settings=PlanSettings(), camera="FC6310")
+    with pytest.raises(OutputError, match="already holds files"):
+        list(iter_plan(order, tmp_path / "out"))

@@ -99,7 +99,7 @@ def iter_depth(
     if not given.survey.clips:
         _enough(given)
     former = former_fields(output)
-    with claimed(output, FILES, overwrite=overwrite):
+    with claimed(output, FILES, overwrite=overwrite, folders=(PAIRS,)):
         for path in former:
             remove_file(path)
         clock = Clock(

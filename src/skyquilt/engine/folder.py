@@ -11,7 +11,7 @@ from pathlib import Path
 
 from skyquilt.engine import error_log
 from skyquilt.engine.lock import FolderLock
-from skyquilt.errors import OutputError
+from skyquilt.errors import OutputError, RefusedError
 from skyquilt.outside import (
     in_use,
     open_regular,
@@ -38,6 +38,10 @@ CONTRACT = (
 )
 """Files of a finished run."""
 STATE, EXPORTS, LOCK = ".skyquilt", "export", "run.lock"
+UNFINISHED, PROBE = "unfinished", ".probe"
+"""What stands in a folder of results while a command without a run works there, and a file by which
+is seen whether it can be written.
+"""
 FILES = {
     "mosaic.tif": "map",
     "thermal.tif": "thermal map",
@@ -267,34 +271,63 @@ def _other(was: _Known) -> str:
 
 
 @contextmanager
-def claimed(path: Path, names: Sequence[str], *, overwrite: bool) -> Iterator[None]:
+def claimed(
+    path: Path, names: Sequence[str], *, overwrite: bool, folders: Sequence[str] = ()
+) -> Iterator[None]:
     """Creates the folder, or removes the files `names` of an earlier run from it; other files stay.
-    Inside, no other run writes to the folder.
+    Inside, no other run writes to the folder. What a run leaves there that did not get to its end
+    (a full disk, an interrupt, a loss of power) is replaced by the next one. `folders`: those that
+    the command makes.
 
     Raises:
         OutputError: the folder holds files and `overwrite` is not set, is a file, cannot be
             written, or another run works in it.
     """
-    _refuse_file(path)
+    check_room(path, names, overwrite=overwrite, folders=folders)
     try:
-        _refuse_files(path, overwrite)
-        (path / STATE).mkdir(parents=True, exist_ok=True)
+        (path / STATE).mkdir(exist_ok=True)
     except OSError as error:
         raise refusal(path, error) from error
     lock = FolderLock(path, f"{STATE}/{LOCK}", "run")
+    unfinished = path / STATE / UNFINISHED
     try:
         try:
-            _refuse_files(path, overwrite)  # of a run that ended just now
-            for name in names:
+            _refuse_files(path, (*names, *folders), overwrite)  # of a run that ended just now
+            for name in [*names, *(_parts_of(path, names) if unfinished.exists() else ())]:
                 remove_file(path / name)
-            probe = path / ".probe"
-            probe.write_bytes(b"x")
-            probe.unlink()
+            unfinished.touch()
         except OSError as error:
             raise refusal(path, error) from error
-        yield
+        ended = False
+        try:
+            yield
+            ended = True
+        except RefusedError:
+            ended = True  # a refusal is a result, with its files
+            raise
+        finally:
+            with suppress(OSError):  # somebody removed the folder
+                if ended or all(p.name == STATE for p in path.iterdir()):
+                    remove_file(unfinished)
     finally:
         lock.remove()
+
+
+def check_room(
+    path: Path, names: Sequence[str], *, overwrite: bool, folders: Sequence[str] = ()
+) -> None:
+    """Creates the folder and checks that a command may write its results there, before it computes
+    them for long; parameters and errors as those of `claimed`.
+    """
+    _refuse_file(path)
+    try:
+        _refuse_files(path, (*names, *folders), overwrite)
+        path.mkdir(parents=True, exist_ok=True)
+        probe = path / PROBE
+        probe.write_bytes(b"x")
+        probe.unlink()
+    except OSError as error:
+        raise refusal(path, error) from error
 
 
 def make_folder(path: Path) -> None:
@@ -320,12 +353,22 @@ def _refuse_file(path: Path) -> None:
         raise OutputError(f"{place} is {what}; {why}; choose another output folder")
 
 
-def _refuse_files(path: Path, overwrite: bool) -> None:
-    if not overwrite and path.is_dir() and any(p.name != STATE for p in path.iterdir()):
+def _refuse_files(path: Path, names: Sequence[str], overwrite: bool) -> None:
+    if overwrite or not path.is_dir():
+        return
+    held = {p.name for p in path.iterdir()} - {STATE, PROBE}
+    ours = (path / STATE / UNFINISHED).exists() and held <= {*names, *_parts_of(path, names)}
+    if held and not ours:
         raise OutputError(
             f"{path} already holds files; add --overwrite to replace its results, or choose"
             " another folder"
         )
+
+
+def _parts_of(path: Path, names: Sequence[str]) -> list[str]:
+    """Files in a folder of which a run was writing these when it was stopped (`a.tif.partial`)."""
+    begun = tuple(f"{name}." for name in names)
+    return [p.name for p in path.iterdir() if p.name.startswith(begun)]
 
 
 FULL = (errno.ENOSPC, errno.EDQUOT)

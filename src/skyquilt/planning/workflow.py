@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from skyquilt.engine.folder import claimed
+from skyquilt.engine.folder import check_room, claimed
 from skyquilt.errors import UsageError
 from skyquilt.model.event import Event, Note, Result, StageFinished, StageStarted
 from skyquilt.planning.coverage import all_seen, counted, make_cells, sight_may_be_blocked
@@ -73,6 +73,7 @@ def iter_plan(order: Order, output: Path, *, overwrite: bool = False) -> Iterato
     output = Path(output)
     if order.base is not None:
         older_map(order.base)  # refused before the routes are planned
+    check_room(output, _names(output), overwrite=overwrite)
     if is_mission(order.area):
         yield from refilled(order, output, overwrite=overwrite)
         return
@@ -208,10 +209,17 @@ def terrain_of(
 
 def _room(output: Path, overwrite: bool) -> AbstractContextManager[None]:
     """The prepared folder; with `overwrite`, only files of an earlier plan are removed."""
+    return claimed(output, _names(output), overwrite=overwrite)
+
+
+def _names(output: Path) -> tuple[str, ...]:
+    """Files of a plan, with those of the drones of an earlier one."""
     endings = {w.ending for w in WRITERS.values()}
-    old = [p.name for p in output.glob("[0-9][0-9]-*") if p.suffix in endings] \
-        if output.is_dir() else []  # fmt: skip
-    return claimed(output, (*FILES, *old), overwrite=overwrite)
+    try:
+        old = [p.name for p in output.glob("[0-9][0-9]-*") if p.suffix in endings]
+    except OSError:  # the folder is none, which is told when it is to be written
+        old = []
+    return (*FILES, *old)
 
 
 def write_all(output: Path, plan: Plan) -> list[str]:
