@@ -1,11 +1,14 @@
 """The small numbers of drawing: cells, previews and round resolutions."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from skyquilt.errors import OutputError
 from skyquilt.imaging.nodes import STEP
 from skyquilt.model.raster import Grid
-from skyquilt.ortho import companions
+from skyquilt.ortho import companions, orthomosaic
 from skyquilt.ortho.companions import (
     MOST_NUMBERS,
     PROVENANCE,
@@ -73,3 +76,34 @@ def test_resolutions_have_two_digits(gsd, rounded):
 def test_previews_stay_small():
     for size, factor in ((1600, 1), (1601, 2), (3200, 2), (100000, 64)):
         assert preview_factor(Grid(west=0, north=0, gsd=1, width=size, height=10)) == factor
+
+
+@pytest.mark.parametrize("opens", [True, False])
+def test_blocks_of_an_earlier_map_that_are_damaged_are_drawn_again(monkeypatch, opens):
+    """They ended the run in a traceback."""
+
+    class Files:
+        def __init__(self, folder):
+            if not opens:
+                raise OutputError("damaged")
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *why):
+            return None
+
+        def block(self, block, *given):
+            if block == 2:
+                raise OutputError("damaged")
+            return block
+
+    monkeypatch.setattr(orthomosaic, "FormerFiles", Files)
+    monkeypatch.setattr(orthomosaic, "shot_numbers", lambda compose: {})
+    drawing = SimpleNamespace(
+        growth=SimpleNamespace(earlier=SimpleNamespace(shown=())),
+        compose=SimpleNamespace(grid=None),
+        output=None,
+    )
+    found = list(orthomosaic.Drawing._former(drawing, dict.fromkeys([1, 2, 3]), None))
+    assert found == ([1, None, 3] if opens else [None] * 3)

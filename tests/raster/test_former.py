@@ -84,3 +84,18 @@ def test_a_file_that_cannot_be_read(tmp_path, content):
         (tmp_path / "a.tif").write_bytes(content)
     with pytest.raises(OutputError, match="added to"):
         FormerRaster(tmp_path / "a.tif")
+
+
+def test_a_file_that_is_damaged_within(tmp_path):
+    """The decoder's error ended the run in a traceback."""
+    array = picture(1500, 1300)[..., :1]
+    write_array(tmp_path / "a.tif", array, spec_for(array, compress="zstd"))
+    data = bytearray((tmp_path / "a.tif").read_bytes())
+    third = len(data) // 3
+    data[third : 2 * third] = bytes(third)
+    (tmp_path / "a.tif").write_bytes(data)
+    with FormerRaster(tmp_path / "a.tif") as former:
+        with pytest.raises(OutputError, match="added to"):
+            former.band()
+        with pytest.raises(OutputError, match="added to"):
+            former.pixels(0, 0, 1500, 1300)

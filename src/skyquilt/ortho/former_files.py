@@ -9,6 +9,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.errors import OutputError
 from skyquilt.imaging.nodes import STEP
 from skyquilt.model.raster import Grid, Window
 from skyquilt.ortho.companions import BlockExtras, preview_factor, provenance_step, reduced
@@ -66,6 +67,9 @@ class FormerFiles:
     ) -> FormerBlock:
         """A block that lies at a window of the earlier map, at a multiple of a tile. `names`: the
         shot number now of each former one; `grid`: that of the map now.
+
+        Raises:
+            OutputError: it is damaged in a file.
         """
         pixels, valid = self._map.pixels(old.row, old.column, old.height, old.width)
         down, right = (old.row - block.row0) // spec.tile, (old.column - block.col0) // spec.tile
@@ -78,12 +82,15 @@ class FormerFiles:
             tuple(slice(at // step, -(-(at + size) // step)) for at, size in _sides(old))
             for step in (provenance_step(grid), STEP)
         )
+        shots = self._provenance[fine]
+        if shots.max(initial=0) >= len(names):
+            raise OutputError("provenance.tif names photos that the map did not show")
         return FormerBlock(
             pixels=pixels,
             valid=valid,
             encoded=tiles,
             extras=BlockExtras(
-                provenance=names[self._provenance[fine]],
+                provenance=names[shots],
                 views=self._views[coarse].astype(np.uint16),
                 preview=preview,
                 shown=shown,

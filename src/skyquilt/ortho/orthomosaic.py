@@ -3,6 +3,7 @@ shows, how many photos see it, and a preview.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -16,7 +17,7 @@ from skyquilt.engine.folder import STATE
 from skyquilt.engine.pixel_cache import PhotoParts
 from skyquilt.engine.store import Store, digest
 from skyquilt.engine.workers import Workers
-from skyquilt.errors import UsageError
+from skyquilt.errors import OutputError, UsageError
 from skyquilt.imaging.nodes import View
 from skyquilt.model.poses import Alignment
 from skyquilt.model.raster import Window
@@ -166,12 +167,13 @@ class Drawing:
             for block in {*_blocks(spec)} - {*todo}:
                 self._leave(block)
             for done, block in enumerate(todo):  # in this order few overview tiles are open
-                if block in stay:
-                    former = next(kept)
+                former = next(kept) if block in stay else None
+                if former is not None:
                     pixels, valid, extras = former.pixels, former.valid, former.extras
                     encoded = former.encoded
                 else:
-                    (pixels, valid, extras), encoded = next(drawn), None
+                    found = one(block) if block in stay else next(drawn)
+                    (pixels, valid, extras), encoded = found, None
                 self.store.put("blocks", self._block_key(block), extras)
                 self._leave(block)
                 writer.write_block(block, pixels, valid, encoded)
@@ -193,15 +195,24 @@ class Drawing:
         if self.parts is not None:
             self.parts.done((block.row0, block.col0))
 
-    def _former(self, stay: Mapping[Block, Window], spec: RasterSpec) -> Iterator[FormerBlock]:
-        """These blocks, from the files of the earlier map."""
+    def _former(
+        self, stay: Mapping[Block, Window], spec: RasterSpec
+    ) -> Iterator[FormerBlock | None]:
+        """These blocks, from the files of the earlier map; None for what is damaged there."""
         if self.growth is None or not stay:
             return
         table = shot_numbers(self.compose)
         names = np.array([0, *(table[i] for i in self.growth.earlier.shown)], np.uint32)
-        with FormerFiles(self.output) as files:
+        with ExitStack() as opened:
+            files: FormerFiles | None = None
+            with suppress(OutputError):
+                files = opened.enter_context(FormerFiles(self.output))
             for block, old in stay.items():
-                yield files.block(block, old, spec, names, self.compose.grid)
+                former = None
+                if files is not None:
+                    with suppress(OutputError):
+                        former = files.block(block, old, spec, names, self.compose.grid)
+                yield former
 
     def companions(self) -> Drawn:
         """Writes provenance.tif and views.tif, and returns them."""

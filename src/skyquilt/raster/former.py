@@ -3,6 +3,7 @@ encoded tiles themselves, so that nothing is compressed twice.
 """
 
 import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.errors import OutputError
+from skyquilt.outside import out_of_memory
 from skyquilt.raster.assemble import CODES
 from skyquilt.raster.spec import RasterSpec
 
@@ -29,11 +31,10 @@ class FormerRaster:
         """
         import tifffile  # most runs add nothing
 
-        try:
+        self._path = path
+        with self._readable():
             self._file = tifffile.TiffFile(path)
             pages = [p for p in self._file.pages if isinstance(p, tifffile.TiffPage)]
-        except (OSError, ValueError, IndexError, tifffile.TiffFileError) as error:
-            raise OutputError(f"cannot read {path}, which photos are to be added to") from error
         if not pages:
             raise OutputError(f"{path} is damaged, so no photos can be added to it")
         self._page = pages[0]
@@ -51,16 +52,35 @@ class FormerRaster:
     ) -> None:
         self._file.close()
 
+    @contextlib.contextmanager
+    def _readable(self) -> Iterator[None]:
+        """Turns whatever decoders raise into an `OutputError`."""
+        try:
+            yield
+        except Exception as error:
+            if out_of_memory(error):
+                raise
+            raise OutputError(
+                f"cannot read {self._path}, which photos are to be added to"
+            ) from error
+
     def band(self) -> NDArray[Any]:
-        """All pixels (h, w) of a raster of one band."""
-        return np.asarray(self._page.asarray())
+        """All pixels (h, w) of a raster of one band; raises OutputError where it is damaged."""
+        with self._readable():
+            return np.asarray(self._page.asarray())
 
     def pixels(
         self, row: int, column: int, height: int, width: int
     ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         """Pixels (h, w, bands) of a window whose first one is the first of a tile, and which are
-        valid (h, w); zero where the file has no tile.
+        valid (h, w); zero where the file has no tile. Raises OutputError where it is damaged.
         """
+        with self._readable():
+            return self._pixels(row, column, height, width)
+
+    def _pixels(
+        self, row: int, column: int, height: int, width: int
+    ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         page, tile = self._page, self._page.tilewidth
         pixels = np.zeros((height, width, page.samplesperpixel), page.dtype)
         shown = np.zeros((height, width), np.bool_)

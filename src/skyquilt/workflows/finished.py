@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from skyquilt.engine.folder import stamps
 from skyquilt.engine.store import Store, digest
 from skyquilt.errors import OutputError
 from skyquilt.model.photo import ControlPoint, Photo
@@ -52,8 +53,8 @@ class Finished:
     """Corrections of brightness."""
     shown: tuple[int, ...]
     """The photos that it shows, by their number in provenance.tif, from 1."""
-    files: tuple[tuple[int, ...], ...]
-    """Size and time of its rasters."""
+    files: tuple[str, ...]
+    """What tells its rasters from others (`stamp`)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -108,7 +109,7 @@ class Earlier:
             labels=labels and _labels(labels, where),
             shown=tuple(where.get(i, -1) for i in known.shown),
             key=self.key,
-            files=known.files == sizes_and_times(output),
+            files=known.files == stamps_of(output),
         )
 
     def _where(self, photos: Sequence[Photo]) -> dict[int, int]:
@@ -123,10 +124,9 @@ def control_key(control: Sequence[ControlPoint]) -> str:
     return digest(list(control))
 
 
-def sizes_and_times(output: Path) -> tuple[tuple[int, ...], ...]:
-    """Size and time of a run's rasters: whether they are still those that were written."""
-    found = (output / name for name in FILES)
-    return tuple((p.stat().st_size, p.stat().st_mtime_ns) if p.is_file() else () for p in found)
+def stamps_of(output: Path) -> tuple[str, ...]:
+    """Stamps of a run's rasters: whether they are still those that were written."""
+    return tuple(stamps(output, FILES).values())
 
 
 def earlier_map(store: Store, recipe: str, output: Path) -> Earlier | None:

@@ -9,7 +9,7 @@ from skyquilt.ortho.earlier import same_pose
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.orthomosaic import used_photos
 from skyquilt.report.tables import added_sentence
-from skyquilt.workflows.finished import Finished, control_key, sizes_and_times
+from skyquilt.workflows.finished import Finished, control_key, stamps_of
 from skyquilt.workflows.flow import AlignedPhotos, DrawnMap
 from skyquilt.workflows.keys import photo_key
 
@@ -30,7 +30,7 @@ def finished(
         grid=ground.grid,
         exposure=drawn.exposure,
         shown=tuple(used_photos(ground.views)),
-        files=sizes_and_times(output),
+        files=stamps_of(output),
     )
 
 
