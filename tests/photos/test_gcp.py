@@ -50,7 +50,9 @@ def test_one_point_at_two_places_of_a_photo_is_refused(tmp_path, photo):
     rows = [f"{x} {y} 100 {column} 6 DJI_0001.JPG a\n" for column in (5, 9)]
     with pytest.raises(SideFileError, match=r"a is observed at two places of DJI_0001.JPG"):
         checked(tmp_path, photo, "EPSG:4326\n" + "".join(rows))
-    assert len(checked(tmp_path, photo, "EPSG:4326\n" + 2 * rows[0])) == 1
+    # a row that stands there twice counted twice
+    (point,) = checked(tmp_path, photo, "EPSG:4326\n" + 2 * rows[0])
+    assert len(point.observations) == 1
 
 
 ROW = ("446363.450", "5160978.180", "437.678", "33.10", "51.48", "DJI_0001.JPG", "p 1")
@@ -63,6 +65,7 @@ ROW = ("446363.450", "5160978.180", "437.678", "33.10", "51.48", "DJI_0001.JPG",
         ",".join(ROW),
         ", ".join(ROW),
         ";".join(ROW),
+        ",".join(f'"{w}"' for w in ROW),
         ";".join(w.replace(".", ",") for w in ROW[:5]) + ";" + ";".join(ROW[5:]),
         "\t".join(w.replace(".", ",") for w in ROW[:5]) + "\t" + "\t".join(ROW[5:]),
         "geo_x geo_y geo_z im_x im_y image_name gcp_name\n" + "\t".join(ROW),

@@ -64,6 +64,9 @@ FILES = {
     "commas.csv": f"name;lat;lon;alt\n{NAME};{N};{W};{HEIGHT} m\n".replace(".", ",").replace(
         ",JPG", ".JPG"
     ),
+    "blanks.csv": f"name lat lon alt\n{NAME} {LAT} {LON} {HEIGHT}\n".replace(".", ",").replace(
+        ",JPG", ".JPG"
+    ),
     "hemispheres.tsv": f"name\tlat\tlon\talt\n{NAME}\tN {LAT}\t{-LON} W\t{HEIGHT}\n",
     "utm.csv": f"EPSG:32615\nname,easting,northing,height\n{NAME},{EAST},{NORTH},{HEIGHT}\n",
     "text.txt": f"name,lat,lon,alt\n{NAME},{LAT},{LON},{HEIGHT}\n",

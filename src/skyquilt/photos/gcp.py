@@ -120,11 +120,11 @@ def _notes(path: Path, strangers: list[str], points: list[ControlPoint]) -> tupl
 
 
 def _words(line: str) -> list[str]:
-    """The columns of a line, separated by tabs, blanks, semicolons or commas, numbers with decimal
-    points.
+    """The columns of a line, separated by tabs, blanks, semicolons or commas, without quotes, numbers
+    with decimal points.
     """
     for mark in ("\t", None, ";", ","):
-        words = [w.strip() for w in line.split(mark) if w.strip()]
+        words = [bare for w in line.split(mark) if (bare := w.strip(' "'))]
         if mark != "," and with_decimal_commas(words):
             words = with_points(words)
         if len(words) >= 6 and all(number(w) is not None for w in words[:2]):
@@ -171,7 +171,8 @@ def _point(
         raise SideFileError(
             f"{path.name}: point {label} has two different places. Correct one of the rows."
         )
-    seen = ((names.find(s.image), s) for s in group)
+    # a row that stands there twice was measured once
+    seen = ((names.find(s.image), s) for s in dict.fromkeys(group))
     return ControlPoint(
         name=label,
         x=first.x,

@@ -153,7 +153,7 @@ def read_positions(path: Path) -> tuple[tuple[SideRow, ...], tuple[str, ...]]:
     (above take-off) or ellipsoid in m; yaw, pitch, roll in degrees (pitch 0 = nadir; below -45 it
     is read as a gimbal's); accuracy, vertical_accuracy in m. Only the name is required. A table
     without a header has name, latitude, longitude and height. Decimal commas are read where
-    semicolons or tabs separate the columns.
+    semicolons, tabs or blanks separate the columns.
     """
     table = _read(path)
     columns = table.columns
@@ -225,10 +225,10 @@ def _read(path: Path) -> _Table:
     comments = [line.lstrip("# ") for line in lines[:first]]
     mark = max(",;\t", key=data[0].count)
     table = _cells(data, mark, path)
-    if mark != "," and with_decimal_commas(cell for row in table for cell in row):
+    blanks = mark not in data[0]
+    if (blanks or mark != ",") and with_decimal_commas(cell for row in table for cell in row):
         table = [with_points(row) for row in table]
     columns = _columns(table[0], path)
-    blanks = mark not in data[0]
     if _complete(columns):
         if blanks and columns["name"] == 0:
             table = [_with_blanks(row, len(table[0])) for row in table]
