@@ -1,7 +1,10 @@
 """Ways around keep-outs, the lower bound, endurance, separation, clearance."""
 
 import itertools
+import signal
 import sys
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -18,6 +21,7 @@ from skyquilt.planning.settings import PlanSettings
 from skyquilt.planning.site import make_site
 from skyquilt.planning.terrain import FLAT, Terrain
 from skyquilt.planning.times import ground_speed
+from skyquilt.planning.tours import Vehicle, tours
 from skyquilt.planning.turns import STEP_RAD, curves, drawn
 from skyquilt.planning.view import find_view
 
@@ -264,3 +268,23 @@ def test_without_or_tools_a_sentence_says_what_to_install(monkeypatch):
     site = make_site(box(0, 0, 90, 90), (), ZONE)
     with pytest.raises(UsageError, match=r'pip install .*"\.\[plan\]"'):
         plan_routes(site, grid(3, 3), fleet(1), QUICK, FLAT, 60.0)
+
+
+def test_an_interrupt_ends_the_search():
+    """OR-tools loses what is raised in functions that it calls: Ctrl-C did nothing."""
+    places = np.random.default_rng(3).uniform(0, 1000, (60, 2))
+    apart = np.hypot(*(places[:, None] - places).T)
+    far = np.hypot(*places.T)
+    vehicle = Vehicle(times=apart, out=far, home=far, usable=1e9)
+    former = signal.signal(signal.SIGINT, signal.default_int_handler)
+    pressed = threading.Timer(0.7, signal.raise_signal, [signal.SIGINT])
+    began = time.process_time()
+    try:
+        pressed.start()
+        with pytest.raises(KeyboardInterrupt):
+            tours([vehicle, vehicle], 20.0)
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        pressed.join()
+        signal.signal(signal.SIGINT, former)
+    assert time.process_time() - began < 4  # 20 without an interrupt

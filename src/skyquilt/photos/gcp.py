@@ -120,8 +120,8 @@ def _notes(path: Path, strangers: list[str], points: list[ControlPoint]) -> tupl
 
 
 def _words(line: str) -> list[str]:
-    """The columns of a line, separated by tabs, blanks, semicolons or commas, without quotes, numbers
-    with decimal points.
+    """The columns of a line, separated by tabs, blanks, semicolons or commas, without quotes,
+    numbers with decimal points.
     """
     for mark in ("\t", None, ";", ","):
         words = [bare for w in line.split(mark) if (bare := w.strip(' "'))]

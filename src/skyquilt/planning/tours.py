@@ -2,8 +2,11 @@
 route.
 """
 
+import signal
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -67,13 +70,34 @@ def tours(vehicles: Sequence[Vehicle], seconds: float) -> list[list[int]] | None
     """
     library = solver()
     n = len(vehicles[0].out)
-    whole = _one_tour(library, vehicles[0], min(0.25 * seconds, 4.0))
+    with _interrupts() as heard:
+        whole = _one_tour(library, vehicles[0], min(0.25 * seconds, 4.0), heard)
     start = divided(vehicles, whole)
     if n > MOST_SEARCHED:
         return start if _fits(vehicles, start) else None
-    found = _searched(library, vehicles, start, seconds)
+    with _interrupts() as heard:
+        found = _searched(library, vehicles, start, seconds, heard)
     options = [r for r in (start, found) if r is not None and _fits(vehicles, r)]
     return min(options, key=lambda r: _longest(vehicles, r), default=None)
+
+
+@contextmanager
+def _interrupts() -> Iterator[list[int]]:
+    """Gives a list that is no longer empty once Ctrl-C was pressed, which ends a search: what is
+    raised in a function that OR-tools calls is lost. It is raised afterwards.
+    """
+    heard: list[int] = []
+    former = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(former):
+        yield heard
+        return
+    signal.signal(signal.SIGINT, lambda number, _: heard.append(number))
+    try:
+        yield heard
+    finally:
+        signal.signal(signal.SIGINT, former)
+    if heard:
+        former(signal.SIGINT, None)
 
 
 def _fits(vehicles: Sequence[Vehicle], routes: Sequence[Sequence[int]]) -> bool:
@@ -84,7 +108,7 @@ def _longest(vehicles: Sequence[Vehicle], routes: Sequence[Sequence[int]]) -> fl
     return max(v.length(r) for v, r in zip(vehicles, routes, strict=True))
 
 
-def _one_tour(library: Any, vehicle: Vehicle, seconds: float) -> list[int]:
+def _one_tour(library: Any, vehicle: Vehicle, seconds: float, heard: list[int]) -> list[int]:
     """A short closed tour through all points."""
     n = len(vehicle.out)
     if n < 4:
@@ -93,7 +117,7 @@ def _one_tour(library: Any, vehicle: Vehicle, seconds: float) -> list[int]:
     model = library.RoutingModel(manager)
     whole = np.rint(np.minimum(vehicle.times, vehicle.times.T) * UNIT).astype(np.int64)
     model.SetArcCostEvaluatorOfAllVehicles(model.RegisterTransitMatrix(whole.tolist()))
-    parameters = _parameters(library, model, seconds, guided=n <= MOST_SEARCHED)
+    parameters = _parameters(library, model, seconds, heard, guided=n <= MOST_SEARCHED)
     found = model.SolveWithParameters(parameters)
     if found is None:
         return list(range(n))
@@ -158,7 +182,7 @@ def _filled(
     return routes if at == len(sequence) else None
 
 
-def _parameters(library: Any, model: Any, seconds: float, *, guided: bool) -> Any:
+def _parameters(library: Any, model: Any, seconds: float, heard: list[int], *, guided: bool) -> Any:
     from ortools.constraint_solver import routing_enums_pb2 as names
 
     parameters = library.DefaultRoutingSearchParameters()
@@ -167,13 +191,18 @@ def _parameters(library: Any, model: Any, seconds: float, *, guided: bool) -> An
         parameters.local_search_metaheuristic = names.LocalSearchMetaheuristic.GUIDED_LOCAL_SEARCH
     seconds = max(seconds, 0.05)
     end = time.process_time() + seconds
-    model.AddSearchMonitor(model.solver().CustomLimit(lambda: time.process_time() > end))
+    over = model.solver().CustomLimit(lambda: bool(heard) or time.process_time() > end)
+    model.AddSearchMonitor(over)
     parameters.time_limit.FromMilliseconds(int(LONGEST * seconds * 1000))
     return parameters
 
 
 def _searched(
-    library: Any, vehicles: Sequence[Vehicle], start: list[list[int]], seconds: float
+    library: Any,
+    vehicles: Sequence[Vehicle],
+    start: list[list[int]],
+    seconds: float,
+    heard: list[int],
 ) -> list[list[int]] | None:
     n, k = len(vehicles[0].out), len(vehicles)
     # nodes: points, then the ground (each vehicle has its own legs from and to it)
@@ -196,7 +225,7 @@ def _searched(
     goal = int(UNIT * GOAL * sum(v.length(r) for v, r in zip(vehicles, start, strict=True)) / k)
     for number in range(k):
         duration.SetCumulVarSoftUpperBound(model.End(number), goal, 1)
-    parameters = _parameters(library, model, seconds, guided=True)
+    parameters = _parameters(library, model, seconds, heard, guided=True)
     model.CloseModelWithParameters(parameters)
     first = model.ReadAssignmentFromRoutes(start, True)
     found = (
