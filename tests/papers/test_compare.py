@@ -13,6 +13,7 @@ import pytest
 from skyquilt.errors import OutputError
 from skyquilt.model.event import Result, StageFinished, StageStarted
 from skyquilt.papers.compare import CompareSettings, iter_compare
+from skyquilt.papers.compare_state import taken_up
 from skyquilt.workflows.methods import MosaicSettings
 
 SETTINGS = CompareSettings(
@@ -140,3 +141,11 @@ def test_a_comparison_that_is_replaced_leaves_no_columns(flight, tmp_path):
     }
     assert [p.name for p in (out / "position").iterdir()] == ["mine.txt"]
     assert [p.name for p in (out / "bundle").iterdir()] == ["notes.txt"]
+
+
+@pytest.mark.parametrize("name", ["a file", "a file/below", "a link", "a link/below"])
+def test_a_folder_that_cannot_be_made_is_refused_in_plain_words(tmp_path, name):
+    (tmp_path / "a file").write_text("mine")
+    (tmp_path / "a link").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(OutputError, match="a (file is a file|link is a link that leads nowhere);"):
+        taken_up(tmp_path / name, "key", overwrite=False)

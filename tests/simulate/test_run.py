@@ -148,6 +148,15 @@ def test_a_used_folder_is_refused(survey, tmp_path):
     assert not (tmp_path / ".scratch").exists()
 
 
+@pytest.mark.parametrize("name", ["a file", "a file/below", "a link", "a link/below"])
+def test_a_folder_that_cannot_be_made_is_refused_in_plain_words(tmp_path, name):
+    """They were the system's: "File exists", "Not a directory"."""
+    (tmp_path / "a file").write_text("mine")
+    (tmp_path / "a link").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(OutputError, match="a (file is a file|link is a link that leads nowhere);"):
+        next(simulate(settings(thermal=None, route=Route(photos=2)), tmp_path / name))
+
+
 def test_command_with_every_option(tmp_path):
     words = """--preset demo --photos 6 --overlap 70 --sidelap 50 --height 70 --heading 75
     --size 240x180 --gps-noise 1 --gps-missing 1 --yaw-lie tag --altitude-drift 20 --focal-error 2

@@ -4,7 +4,7 @@ import json
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from skyquilt.engine.folder import STATE, refusal
+from skyquilt.engine.folder import STATE, make_folder, refusal
 from skyquilt.errors import OutputError
 from skyquilt.raster.atomic import write_text
 
@@ -37,8 +37,7 @@ def taken_up(output: Path, key: str, *, overwrite: bool) -> tuple[CompareState, 
     Raises:
         OutputError: the folder contains a finished comparison, or one of other photos or settings.
     """
-    if output.exists() and not output.is_dir():
-        raise OutputError(f"{output} is a file; the output is a folder")
+    make_folder(output)
     known = _read(output)
     finished = any((output / name).exists() for name in FILES) and (known is None or known.done)
     if known is not None and known.key == key and not finished:

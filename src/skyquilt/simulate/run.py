@@ -1,5 +1,6 @@
 """The workflow of the simulator: from settings to a folder of photos with their truth."""
 
+import os
 import shutil
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass, replace
@@ -218,8 +219,12 @@ def _make_room(output: Path, overwrite: bool) -> None:
     """Prepares the output folder; with `overwrite`, only files of an earlier simulation are
     removed.
     """
-    if output.exists() and not output.is_dir():
-        raise OutputError(f"{output} is a file; a folder is needed")
+    place = output.absolute()
+    while not os.path.lexists(place):
+        place = place.parent
+    if not place.is_dir():
+        what = "a file" if place.exists() else "a link that leads nowhere"
+        raise OutputError(f"{place} is {what}; a folder is needed there")
     if output.is_dir() and any(output.iterdir()):
         if not overwrite:
             raise OutputError(f"{output} is not empty; choose another folder or add --overwrite")
