@@ -1,8 +1,10 @@
 """Stage: the clips of a survey are looked through, and the chosen frames join its photos."""
 
+import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from skyquilt.engine.clock import Steps
 from skyquilt.engine.folder import refusal
@@ -11,10 +13,12 @@ from skyquilt.errors import NoPhotosError, UnreadablePhotoError
 from skyquilt.model.clip import ChosenFrames, Clip, Looks, Track
 from skyquilt.model.event import Note
 from skyquilt.model.photo import Photo, RejectedPhoto
+from skyquilt.outside import remove_file, walk
 from skyquilt.photos.cameras_json import apply_cameras, read_cameras_json
 from skyquilt.photos.clips import after_others, frames_of
 from skyquilt.photos.frame_files import frame_jpeg
 from skyquilt.photos.survey import placed_plausibly
+from skyquilt.raster.atomic import mended, whole_file
 from skyquilt.settings import InputSettings
 from skyquilt.video.choice import FrameChoice
 from skyquilt.video.clock import Offset, OffsetSearch
@@ -32,6 +36,10 @@ _LEAST_SPAN = 0.6
 """Telemetry that lasts a smaller share of its clip, or the clip of it, belongs to another one."""
 _SPAN_S = 1.0
 """Unless they differ by no more than this: rows may be a second apart."""
+LONGEST_NAME = 240
+"""Bytes of a frame's file name: file systems take 255, a few of them for files in work."""
+_FRAME = re.compile(r".+\.\d{6}\.jpg")
+"""Names of the files of frames."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,16 +118,36 @@ def write_frames(output: Path, photos: Sequence[Photo], pixels: PhotoPixels) -> 
     Raises:
         OutputError: the disk is full or read-only.
     """
-    frames = [(i, p) for i, p in enumerate(photos) if p.frame_s is not None]
     folder = output / "frames"
-    for done, (index, photo) in enumerate(frames, 1):
-        path = folder / f"{photo.name}.jpg"
+    frames = [(i, p, folder / frame_file(p)) for i, p in enumerate(photos) if p.frame_s is not None]
+    kept = {path for *_, path in frames}
+    for done, (index, photo, path) in enumerate(frames, 1):
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(frame_jpeg(photo, pixels(index)))
         except OSError as error:
             raise refusal(folder, error) from error
+        if done == 1:  # of an earlier run that chose others
+            for here, _, names in walk(folder):
+                for name in names:
+                    if _FRAME.fullmatch(name) and here / name not in kept:
+                        with mended(here / name):
+                            remove_file(here / name)
+        with whole_file(path) as file:
+            file.write(frame_jpeg(photo, pixels(index)))
         yield done, len(frames)
+
+
+def frame_file(photo: Photo) -> str:
+    """Path of a frame's file below `frames`: its name, of which the front is cut and replaced by a
+    hash where no file system could take it with its ending.
+    """
+    path = PurePosixPath(f"{photo.name}.jpg")
+    whole = os.fsencode(path.name)
+    if len(whole) <= LONGEST_NAME:
+        return str(path)
+    apart = f"{digest(photo.name)[:8]}~"
+    end = whole[len(whole) - LONGEST_NAME + len(apart) :].decode("utf-8", "ignore")
+    return str(path.with_name(apart + end))
 
 
 def _looks_in(clip: Clip, look: Looker) -> int:
