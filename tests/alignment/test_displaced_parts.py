@@ -163,7 +163,7 @@ def test_a_place_between_two_parts_is_as_uncertain_as_half_of_what_they_are_apar
         return replace(
             alignment(),
             accuracy=Accuracy(
-                xyz=some, sigma_m=some, shared_m=shared, focal_share=1.0, design_effect=1.0
+                xyz=some, sigma_m=some, shared_m=shared, focal_shares={}, design_effect=1.0
             ),
         )
 

@@ -79,6 +79,34 @@ def test_the_accuracy_is_that_of_the_ground_that_other_photos_show(block):
     assert without_photos(found, {}) is found
 
 
+def test_nothing_is_told_of_cameras_whose_photos_were_all_left_out(block):
+    """A screenshot's own camera, whose focal length it does not determine, and its note."""
+    _, found = block
+    other = "screen 2400x1080"
+    (own,) = set(found.camera_of.values())
+    told = replace(found.accuracy, focal_shares={own: 0.2, other: 0.9})
+    notes = tuple(
+        f"{begins} {rest}"
+        for key in (own, f"{other} 3mm", other)
+        for begins, rest in (
+            (f"{outcome.UNSETTLED} of {key}:", "it stays uncertain."),
+            (f"The photos of {key}", f"{outcome.NO_FIT}: so."),
+            (f"The photos of {key}", f"{outcome.SEEM}: so."),
+        )
+    )
+    found = replace(
+        found,
+        camera_of={**found.camera_of, 1: other},
+        cameras={**found.cameras, other: found.cameras[own]},
+        accuracy=told,
+        notes=notes,
+    )
+    assert outcome.of_placed(found) is found
+    left = outcome.of_placed(without_photos(found, {1: "a screenshot"}))
+    assert left.notes == notes[:6]
+    assert left.accuracy.focal_share == 0.2 and found.accuracy.focal_share == 0.9
+
+
 def test_the_accuracy_is_not_that_of_points_too_uncertain_for_the_ground(block):
     """Three points high above others of the ground, known to 20 m, are no tie points any more."""
     _, found = block
@@ -107,3 +135,18 @@ def test_points_that_nothing_determines_tell_nothing_of_the_ground(monkeypatch):
     assert found.sigma_m.max() <= plain.sigma_m.max() and found.sigma_m.max() < 5
     monkeypatch.setattr(outcome, "point_deviations", lambda *g: np.full_like(told(*g), 31622.8))
     assert Flown(3).aligned().accuracy.sigma_m.min() > 31622  # all that is known
+
+
+def test_photos_without_a_position_state_no_deviation_of_it():
+    """Four of the photos have a position, known to 4 m: so well is the place of the map."""
+    flown = Flown(4, gps=4.0)
+    n = len(flown.priors)
+    told = {0, 3, n - 4, n - 1}
+    nowhere = np.full(3, np.nan)
+    flown.priors = [
+        p if i in told else replace(p, map_C=nowhere, sigma_C=np.full(3, np.inf))
+        for i, p in enumerate(flown.priors)
+    ]
+    found = flown.aligned()
+    assert len(found.poses) == n > 2 * len(told)
+    assert found.accuracy.shared_m == pytest.approx((4.0, 8.0))

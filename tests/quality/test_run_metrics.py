@@ -87,7 +87,7 @@ def test_the_accuracy_is_that_of_the_ground_that_the_map_shows():
         xyz=np.array([[12.0, 20, 0], [18.0, 12, 0], [25.0, 20, 0], [9000.0, 20, 0], [12.0, -5, 0]]),
         sigma_m=np.array([[1.0, 1, 2], [2.0, 2, 5], [7.0, 7, 7], [9e3, 9e3, 9e3], [8.0, 8, 8]]),
         shared_m=(1.5, 3.0),
-        focal_share=0.5,
+        focal_shares={"a": 0.5},
         design_effect=2.0,
     )
     found = accuracy_figures(told, seen, grid)

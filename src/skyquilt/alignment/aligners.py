@@ -17,6 +17,7 @@ from skyquilt.alignment.determined import ground_places
 from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.motion import FEWEST_HEADED, headings_by_course
 from skyquilt.alignment.oblique import tilted, without_photos
+from skyquilt.alignment.outcome import of_placed
 from skyquilt.alignment.pose import ByMetadata, ByPose
 from skyquilt.alignment.repair import Repaired, repaired_metadata
 from skyquilt.errors import AlignmentError
@@ -67,7 +68,7 @@ class ByLinks:
 
     bundle: Bundle = field(default_factory=Bundle)
     """The adjustment."""
-    version: ClassVar[int] = 15
+    version: ClassVar[int] = 16
     needs_links: ClassVar[bool] = True
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -78,7 +79,7 @@ class ByLinks:
         """
         inputs, said = without_crowded(inputs)
         if inputs.former is not None and (grown := added(inputs, self.bundle)) is not None:
-            return without_strange_blocks(with_loose_photos(grown, inputs), inputs)
+            return of_placed(without_strange_blocks(with_loose_photos(grown, inputs), inputs))
         control = control_in_frame(inputs.control, inputs.photos, inputs.frame)
         found = self.bundle(
             inputs.photos,
@@ -100,7 +101,7 @@ class ByLinks:
         found = without_copied_views(found, [p.name for p in inputs.photos], told, bare)
         found = replace(found, notes=(*found.notes, *said, *one_place_notes(inputs)))
         found = without_strange_blocks(with_loose_photos(found, inputs), inputs)
-        return replace(found, why=REQUESTED)
+        return replace(of_placed(found), why=REQUESTED)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 from skyquilt.alignment.adjust import Covariance
 from skyquilt.alignment.deviations import drift, likeness, point_deviations
 from skyquilt.alignment.problem import Problem, State, residuals_px
-from skyquilt.alignment.setup import Setup
+from skyquilt.alignment.setup import TURNED, Setup
 from skyquilt.alignment.stages import heights_above, prune
 from skyquilt.alignment.tracks import Tracks
 from skyquilt.alignment.triangulate import polish, triangulated
 from skyquilt.model.camera import PARAMETERS
-from skyquilt.model.poses import Accuracy, TiePoints, no_ties
+from skyquilt.model.poses import Accuracy, Alignment, TiePoints, no_ties
 
 Array = NDArray[np.float64]
 SAMPLED = 400
@@ -35,6 +35,8 @@ third longer.
 """
 ASPECT = PARAMETERS.index("aspect")
 """Column of the aspect ratio among the intrinsics."""
+SEEM = "seem to be stretched"
+"""Words of the note of a camera whose ratio of focal lengths is far off."""
 NO_FIT = "do not fit a camera as it is taken for"
 """Words of the note of a camera whose residuals correlate so."""
 
@@ -134,7 +136,7 @@ def accuracy(setup: Setup, problem: Problem, state: State, covariance: Covarianc
         xyz=state.X[sample],
         sigma_m=sigma,
         shared_m=(0.0, 0.0) if tied else _shared(setup, problem, state),
-        focal_share=_focal_share(problem, covariance),
+        focal_shares=_focal_shares(setup, problem, covariance),
         design_effect=problem.design_effect,
     )
 
@@ -144,15 +146,20 @@ def _shared(setup: Setup, problem: Problem, state: State) -> tuple[float, float]
     of positions one after the other have in common. An instrument that drifts over a flight is as
     far off at its start as it may drift, and their mean tells nothing of it.
     """
-    stated = np.median(setup.stated_sigma_C, axis=0)
+    known = np.isfinite(problem.C0)  # of a photo without a position nothing is stated
+    stated = [
+        np.median(sigma[own] if own.any() else sigma)
+        for sigma, own in zip(setup.stated_sigma_C.T, known.T, strict=True)
+    ]
     error = state.C - problem.C0
     return (max(float(stated[0]), drift(error[:, :2])), max(float(stated[2]), drift(error[:, 2:])))
 
 
-def _focal_share(problem: Problem, covariance: Covariance) -> float:
-    """Largest ratio of a focal length's deviation after the adjustment to that before."""
+def _focal_shares(setup: Setup, problem: Problem, covariance: Covariance) -> dict[str, float]:
+    """The ratio of each focal length's deviation after the adjustment to that before."""
     after = covariance.camera_sigmas[:, 0]
-    return float(np.max(np.where(problem.free[:, 0], after / problem.sigma_K[:, 0], 0.0)))
+    shares = np.where(problem.free[:, 0], after / problem.sigma_K[:, 0], 0.0)
+    return dict(zip(setup.camera_keys, shares.tolist(), strict=True))
 
 
 def undetermined(
@@ -189,7 +196,7 @@ def misfits(setup: Setup, problem: Problem, state: State) -> tuple[str, ...]:
         apart = float(abs(found - told) / problem.sigma_K[row, ASPECT])
         if problem.free[row, ASPECT] and apart > STRETCHED:
             why = (
-                f"seem to be stretched: self-calibration finds focal lengths along columns and rows"
+                f"{SEEM}: self-calibration finds focal lengths along columns and rows"
                 f" of the ratio {found:.3f}, {apart:.0f} deviations from {told:.4g}. Pictures"
             )
         elif alike[row] > UNFIT:
@@ -206,3 +213,27 @@ def misfits(setup: Setup, problem: Problem, state: State) -> tuple[str, ...]:
             " camera wrote them, or the true focal_x and focal_y in --cameras, help."
         )
     return tuple(notes)
+
+
+def of_placed(found: Alignment) -> Alignment:
+    """The alignment without what is told of cameras that no placed photo was taken with: those of
+    screenshots, copies and photos of other places that were left out.
+    """
+    used = {found.camera_of[i].removesuffix(TURNED) for i in found.poses}
+    idle = {key.removesuffix(TURNED) for key in found.camera_of.values()} - used
+    if not idle:
+        return found
+    begins = tuple(
+        start
+        for key in idle
+        for start in (
+            f"{UNSETTLED} of {key}: ",
+            *(f"The photos of {key} {words}" for words in (SEEM, NO_FIT)),
+        )
+    )
+    told = found.accuracy
+    if told is not None:
+        shares = {key: share for key, share in told.focal_shares.items() if key not in idle}
+        told = replace(told, focal_shares=shares)
+    notes = tuple(note for note in found.notes if not note.startswith(begins))
+    return replace(found, notes=notes, accuracy=told)

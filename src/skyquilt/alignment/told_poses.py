@@ -51,10 +51,12 @@ def believe_told(
                 stated = setup.stated_sigma_C[block][:, axes]
                 own = error[block][:, axes]
                 lone = np.zeros(len(own), bool)
+                measured = np.isfinite(own).all(1)  # of others nothing is stated
+                least = stated[measured] if measured.any() else stated
                 if not setup.in_space:  # there a photo may be alone in a false minimum
-                    lone = lone_errors(own, float(np.median(stated)))
+                    lone = lone_errors(own, float(np.median(least)))
                 noise = position_noise(own[~lone])
-                wanted = np.maximum(stated, noise if (noise > CONFIRMED * stated).any() else 0.0)
+                wanted = np.maximum(stated, noise if (noise > CONFIRMED * least).any() else 0.0)
                 trusted = ~doubted[block][:, axes]
                 given = np.where(trusted, wanted, sigma[block, axes])
                 single |= bool(lone.any())

@@ -1,6 +1,6 @@
 """Where photos are: the map frame, poses, and the result of an alignment."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -167,12 +167,17 @@ class Accuracy:
     """Horizontal and vertical deviation in m of a shift of the whole map that no photo shows: that
     of the positions where no control point ties the map to the ground.
     """
-    focal_share: float
-    """Deviation of the focal length after the adjustment over that before: 1 = the flight tells
-    nothing about it, and heights follow the metadata.
+    focal_shares: Mapping[str, float]
+    """Deviation of each camera's focal length after the adjustment over that before: 1 = the flight
+    tells nothing about it, and heights follow the metadata.
     """
     design_effect: float
     """Observations that tell as much as an independent one (`alignment.deviations`)."""
+
+    @property
+    def focal_share(self) -> float:
+        """The largest of these."""
+        return max(self.focal_shares.values(), default=0.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
