@@ -13,6 +13,7 @@ from skyquilt.alignment.dominant_plane import levelled
 from skyquilt.alignment.enlarged import as_enlarged
 from skyquilt.alignment.equations import NearFactor
 from skyquilt.alignment.false_tilts import alike_off
+from skyquilt.alignment.kept_matches import kept_matches
 from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
 from skyquilt.alignment.motion import speeds_of
 from skyquilt.alignment.near_positions import told_besides
@@ -45,6 +46,9 @@ from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, MapFrame, Prior, TiePoints
 
+ASIDE_AGAIN = 3
+"""Photos that lie elsewhere are kept aside so often at most: without them others show that they do.
+"""
 ROUGHLY = 64
 """Observations per photo of the first stage, which only removes outliers and sets out."""
 
@@ -138,7 +142,11 @@ class Bundle:
         if lowered(found, begun.priors) is not begun.priors:
             notes += (LOWERED,)
         weak = weak_photos(found, begun.priors)
-        if self.repair and (more := found_oblique(found, weak, begun.priors) - begun.aside):
+        for _ in range(ASIDE_AGAIN if self.repair else 0):
+            kept = kept_matches(found, features, links)
+            more = found_oblique(found, weak, begun.priors, kept) - begun.aside
+            if not more:
+                break
             begun = replace(begun, aside=begun.aside | more)
             found = adjust(begun)
             weak = weak_photos(found, begun.priors)

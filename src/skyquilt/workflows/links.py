@@ -256,9 +256,10 @@ class _Linker:
     def key(self) -> str:
         """Key of all links of the survey."""
         photos = [(seen_as(p), p.width, p.height) for p in self.found.photos]
-        methods = self.methods.nearest, self.methods.retrieval, link_photos
+        methods = self.methods
+        by = methods.nearest, methods.retrieval, methods.through_others, link_photos
         places = self.xy if self.views is None else np.column_stack([self.xy, self.views])
-        return digest(photos, places.tolist(), self._recipe, *methods)
+        return digest(photos, places.tolist(), self._recipe, *by)
 
 
 def seen_as(photo: Photo) -> object:
@@ -369,6 +370,16 @@ def _linked(linker: _Linker, workers: Workers) -> Steps[list[Link | RejectedLink
     for batch in workers.each(matched, _batches(rest)):
         tried += batch
         yield len(tried), len(first) + len(rest)
+    sizes = [(p.width, p.height) for p in found.photos]
+    for _ in range(methods.through_others.rounds):
+        links = [k for k in tried if isinstance(k, Link)]
+        more = methods.through_others(links, found.features, sizes, {(k.a, k.b) for k in tried})
+        total = len(tried) + len(more)
+        for batch in workers.each(matched, _batches(more)):
+            tried += batch
+            yield len(tried), total
+        if not any(isinstance(k, Link) for k in tried[total - len(more) :]):
+            break
     return tried
 
 

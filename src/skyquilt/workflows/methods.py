@@ -23,6 +23,7 @@ from skyquilt.engine.kept import Keep
 from skyquilt.imaging.nodes import View
 from skyquilt.matching.candidates import Nearest, Pair, Retrieval
 from skyquilt.matching.matchers import Guided
+from skyquilt.matching.through_others import ThroughOthers
 from skyquilt.matching.verify import Verify
 from skyquilt.model.camera import Camera
 from skyquilt.model.features import Features, Link, Matches, RejectedLink
@@ -146,6 +147,8 @@ class Methods:
     """Pairs by position."""
     retrieval: LookAlikes
     """Pairs by image content."""
+    through_others: ThroughOthers
+    """Pairs by what photos between them show."""
     matcher: Matcher | Guided
     """Matching."""
     verify: Verifier
@@ -177,6 +180,7 @@ def methods_for(settings: MosaicSettings) -> Methods:
         detector=detector_for(settings),
         nearest=Nearest(),
         retrieval=Retrieval(),
+        through_others=ThroughOthers(),
         matcher=matcher_for(settings),
         verify=Verify(epipolar=_epipolar(settings)),
         align=registry.load("alignment", settings.method)(settings),
