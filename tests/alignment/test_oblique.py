@@ -228,17 +228,33 @@ def test_reported_tilts():
 def test_a_photo_that_fell_elsewhere_is_hung_on_the_others_again():
     done = block(LAWN, hills(3000))
     priors = [prior(p.map_C, yaw=0.0) for p in LAWN]
-    assert found_oblique(done, {}, priors) == frozenset()
+    whole = dict.fromkeys(done.held, 1.0)
+    assert found_oblique(done, {}, priors, whole) == frozenset()
     far = done.poses | {3: pose(-16, 41, z=77, pitch=20)}
-    assert found_oblique(replace(done, poses=far), {}, priors) == {3}
+    assert found_oblique(replace(done, poses=far), {}, priors, whole) == {3}
     near = done.poses | {3: pose(20, -30, pitch=20)}  # where it reports: its angles may be false
-    assert found_oblique(replace(done, poses=near), {}, priors) == frozenset()
+    assert found_oblique(replace(done, poses=near), {}, priors, whole) == frozenset()
     level = done.poses | {3: pose(-16, 41, z=77)}  # its position may be false
-    assert found_oblique(replace(done, poses=level), {}, priors) == frozenset()
+    assert found_oblique(replace(done, poses=level), {}, priors, whole) == frozenset()
     untold = [replace(p, sigma_tilt_deg=6.0) for p in priors]
-    assert found_oblique(replace(done, poses=far), {}, untold) == frozenset()
+    assert found_oblique(replace(done, poses=far), {}, untold, whole) == frozenset()
     most = {i: pose(-16, 41, z=77, pitch=20) for i in range(9)}
-    assert found_oblique(replace(done, poses=done.poses | most), {}, priors) == frozenset()
+    assert found_oblique(replace(done, poses=done.poses | most), {}, priors, whole) == frozenset()
+
+
+def test_photos_without_angles_lie_elsewhere_where_they_lost_their_matches():
+    """However they look; and those that look far aslant belong where they keep most of them."""
+    done = block(LAWN, hills(3000))
+    whole = dict.fromkeys(done.held, 1.0)
+    reported = [prior(p.map_C, yaw=0.0) for p in LAWN]
+    untold = [replace(p, sigma_tilt_deg=6.0) for p in reported]
+    aslant = replace(done, poses=done.poses | {3: pose(-16, 41, pitch=40)})
+    assert found_oblique(aslant, {}, untold, whole) == frozenset()
+    assert found_oblique(aslant, {}, untold, whole | {3: 0.7}) == {3}
+    assert found_oblique(done, {}, untold, whole | {3: 0.7}) == frozenset()
+    assert found_oblique(done, {}, untold, whole | {3: 0.5}) == {3}
+    assert found_oblique(done, {}, reported, whole | {3: 0.5}) == frozenset()
+    assert found_oblique(done, {}, untold, dict.fromkeys(whole, 0.5)) == frozenset()
 
 
 def test_the_dominant_plane_levels_the_map_whatever_stands_on_it():

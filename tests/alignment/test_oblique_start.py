@@ -7,6 +7,7 @@ import pytest
 
 from skyquilt.alignment import oblique_start, repairs
 from skyquilt.alignment.bundle import Bundle
+from skyquilt.alignment.control import fit_similarity_3d
 from skyquilt.alignment.oblique_guess import LOWERED, guessed_priors, lowered, misled
 from skyquilt.alignment.oblique_start import (
     aslant,
@@ -115,6 +116,38 @@ def test_an_oblique_survey_is_placed(name):
     away, turned = flown.errors(found)
     assert np.median(away) < 0.8
     assert np.median(turned) < 1.0
+
+
+def by_hand(seed, count=22):
+    """Photos taken round a place, that look to all sides and down by 40 to 90 degrees."""
+    rng = np.random.default_rng(seed)
+    places = []
+    for i in range(count):
+        b, reach = 2 * np.pi * 1.7 * i / count, rng.uniform(5, 35)
+        x, y = reach * np.sin(b), reach * np.cos(b)
+        to = rng.normal(0, 12, 2) - (x, y)
+        yaw = np.degrees(np.arctan2(*to))
+        places.append((x, y, rng.uniform(35, 65), yaw, rng.uniform(0, 50)))
+    return places
+
+
+@pytest.mark.parametrize(
+    "seed", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)]
+)
+def test_photos_by_hand_are_placed_without_angles(seed):
+    """Where links, taken for similarities of the ground's plane, put some of them elsewhere."""
+    flown = Slanting(by_hand(seed), gps=3.0, seed=seed, alike_deg=60)
+    flown.priors = [
+        replace(p, yaw_deg=np.nan, sigma_C=np.array([5.0, 5.0, 15.0])) for p in untold_tilts(flown)
+    ]
+    found = flown.aligned()
+    linked = {i for k in flown.links for i in (k.a, k.b)}
+    assert set(found.poses) == linked
+    C = np.array([found.poses[i].map_C for i in sorted(linked)])
+    true = np.array([flown.truth[i].map_C for i in sorted(linked)])
+    scale, turn = fit_similarity_3d(C - C.mean(0), true - true.mean(0))[:2]
+    off = scale * (C - C.mean(0)) @ turn.T - (true - true.mean(0))
+    assert np.linalg.norm(off, axis=1).max() < 0.3
 
 
 def there_and_back(pitch):

@@ -274,11 +274,12 @@ def _late_positions(last: Tried, survey: Survey) -> Tried:
 
 
 def _late_moments(last: Tried, survey: Survey) -> Tried:
-    """Positions of another moment are moved along the flight."""
+    """Positions of another moment are moved along the flight; views ahead look alike, at first."""
     late = on_time(last.found, last.begun.priors, survey.cameras, survey.speeds)
     if late is None:
         return last
-    return _if_nearer(last, survey, late.priors, "late ", late.note)
+    ahead = _guessed_directions(last, survey)
+    return ahead if ahead is not last else _if_nearer(last, survey, late.priors, "late ", late.note)
 
 
 def _outvoted_positions(last: Tried, survey: Survey) -> Tried:
