@@ -39,8 +39,8 @@ def kept_matches(
 def tie_points_at(
     ties: TiePoints, photo: int, px: NDArray[np.float64], scale: float
 ) -> NDArray[np.int64]:
-    """(n,) the tie point that lies at each place (n, 2) of a photo, -1 where there is none; `scale`:
-    px of the photo per px of the image that was searched for features.
+    """(n,) the tie point that lies at each place (n, 2) of a photo, -1 where there is none.
+    `scale`: px of the photo per px of the image that was searched for features.
     """
     own = np.flatnonzero(ties.photo == photo)
     if not len(own) or not len(px):

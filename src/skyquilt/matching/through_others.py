@@ -11,14 +11,15 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from skyquilt.geometry.transforms import fit, inverse, transfer
+from skyquilt.geometry.transforms import Doubles, fit, inverse
 from skyquilt.matching.candidates import Pair
 from skyquilt.model.features import Features, Link
 
 GRID = 7
 """Places along each side of a photo that are followed into others."""
+TOGETHER = 4096
+"""Chains that are followed at once, which bounds the memory."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,32 +47,34 @@ class ThroughOthers:
         linked: list[dict[int, Link]] = [{} for _ in sizes]
         for k in links:
             linked[k.a][k.b] = linked[k.b][k.a] = k
-        asked = {
-            (min(i, j), max(i, j), between)
-            for i, own in enumerate(linked)
-            if len(own) < self.enough
-            for between in own
-            for j in linked[between]
-            if j != i
-        }
-        asked = {chain for chain in asked if chain[:2] not in tried}
-        shared: dict[Pair, float] = {}
-        maps: dict[Pair, NDArray[np.float64] | None] = {}
+        chains = sorted(
+            {
+                (*pair, between)
+                for i, own in enumerate(linked)
+                if len(own) < self.enough
+                for between in own
+                for j in linked[between]
+                if j != i and (pair := (min(i, j), max(i, j))) not in tried
+            }
+        )
+        maps: dict[Pair, Doubles] = {}
 
-        def mapped(a: int, b: int) -> NDArray[np.float64] | None:
-            """b_H_a of two linked photos."""
+        def mapped(a: int, b: int) -> Doubles:
+            """b_H_a of two linked photos; NaN where their matches tell none."""
             if (a, b) not in maps:
                 k = linked[a][b]
-                pa, pb = features[k.a].px[k.index_a], features[k.b].px[k.index_b]
-                H = fit("affine", pa, pb)
-                maps[k.a, k.b] = H
-                maps[k.b, k.a] = None if H is None else inverse(H)
+                H = fit("affine", features[k.a].px[k.index_a], features[k.b].px[k.index_b])
+                maps[k.a, k.b] = np.full((3, 3), np.nan) if H is None else H
+                maps[k.b, k.a] = inverse(maps[k.a, k.b])
             return maps[a, b]
 
-        for a, b, between in sorted(asked):
-            first, second = mapped(a, between), mapped(between, b)
-            if first is not None and second is not None:
-                share = _share(second @ first, sizes[a], sizes[b])
+        shared: dict[Pair, float] = {}
+        for low in range(0, len(chains), TOGETHER):
+            part = chains[low : low + TOGETHER]
+            H = np.array([mapped(m, b) @ mapped(a, m) for a, b, m in part])
+            ends = np.array([[sizes[a], sizes[b]] for a, b, _ in part], float)
+            shares = np.maximum(_seen(H, ends), _seen(inverse(H), ends[:, ::-1]))
+            for (a, b, _), share in zip(part, shares.tolist(), strict=True):
                 shared[a, b] = max(share, shared.get((a, b), 0.0))
         count, chosen = [0] * len(sizes), list[Pair]()
         for pair in sorted(shared, key=lambda pair: (-shared[pair], pair)):
@@ -83,12 +86,11 @@ class ThroughOthers:
         return sorted(chosen)
 
 
-def _share(b_H_a: NDArray[np.float64], a: tuple[int, int], b: tuple[int, int]) -> float:
-    """The larger one of the shares of photos a and b (width, height in px) that the other shows."""
-    return max(_seen(b_H_a, a, b), _seen(inverse(b_H_a), b, a))
-
-
-def _seen(b_H_a: NDArray[np.float64], a: tuple[int, int], b: tuple[int, int]) -> float:
-    sides = [(np.arange(GRID) + 0.5) / GRID * side for side in a]
-    places = np.stack(np.meshgrid(*sides), -1).reshape(-1, 2)
-    return float(((transfer(b_H_a, places) >= 0) & (transfer(b_H_a, places) < b)).all(1).mean())
+def _seen(b_H_a: Doubles, sizes: Doubles) -> Doubles:
+    """(n,) the share of each first photo that the second one shows; `b_H_a` (n, 3, 3), `sizes`
+    (n, 2, 2): width and height in px of both.
+    """
+    along = (np.arange(GRID) + 0.5) / GRID
+    places = np.stack(np.meshgrid(along, along), -1).reshape(-1, 2)
+    there = (places * sizes[:, :1]) @ np.swapaxes(b_H_a[:, :2, :2], 1, 2) + b_H_a[:, None, :2, 2]
+    return np.asarray(((there >= 0) & (there < sizes[:, 1:])).all(2).mean(1))
