@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.geometry.neighbours import nearest
-from skyquilt.model.features import Features
+from skyquilt.model.features import Features, Link
 
 Pair = tuple[int, int]
 FAR_M = 1e5
@@ -84,6 +84,31 @@ def by_camera(cameras: Sequence[str], map_xy: NDArray[Any]) -> NDArray[np.float6
     if 2 * beside <= known.sum() or not beside:
         return None
     return np.column_stack([map_xy, FAR_M * number])
+
+
+def overlap_reach_m(
+    links: Sequence[Link],
+    features: Sequence[Features],
+    sizes: Sequence[tuple[int, int]],
+    map_xy: NDArray[Any],
+) -> float | None:
+    """Distance in m of positions (n, 2) beyond which photos hardly overlap, estimated from links;
+    None if there are too few. `sizes`: width and height in px of each photo.
+
+    A link gives the image shift in px, and the positions give it in m. Altitudes are not used.
+    """
+    metres_per_px = []
+    for link in links:
+        pa = features[link.a].px[link.index_a].mean(0)
+        pb = features[link.b].px[link.index_b].mean(0)
+        a, b = pa - np.array(sizes[link.a]) / 2, pb - np.array(sizes[link.b]) / 2
+        moved = abs(link.b_S_a * complex(a[0], -a[1]) - complex(b[0], -b[1]))
+        apart = float(np.hypot(*(map_xy[link.a] - map_xy[link.b])))
+        if moved > 0.1 * sizes[link.a][0] and np.isfinite(apart) and apart > 0:
+            metres_per_px.append(apart / moved)
+    if len(metres_per_px) < 5:
+        return None
+    return float(np.median(metres_per_px)) * 0.75 * max(sizes[0])
 
 
 def sequence(count: int, step: int = 1) -> list[Pair]:

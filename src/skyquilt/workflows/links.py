@@ -1,6 +1,6 @@
 """Finds photos that show the same ground: candidate pairs, matches, verified links."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby, pairwise
 from typing import Any
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from skyquilt.alignment.oblique import looked_at
 from skyquilt.alignment.pose import ByPose
 from skyquilt.alignment.start import ground_of
+from skyquilt.alignment.tracks import connected
 from skyquilt.engine.clock import Steps
 from skyquilt.engine.free_memory import give_back_growth
 from skyquilt.engine.store import Store, digest
@@ -18,7 +19,7 @@ from skyquilt.engine.workers import Workers
 from skyquilt.geometry.set_aside import InFile
 from skyquilt.imaging.nodes import View, project_nodes
 from skyquilt.imaging.views import make_views, on_ground
-from skyquilt.matching.candidates import Pair, by_camera, closest, sequence
+from skyquilt.matching.candidates import Pair, by_camera, closest, overlap_reach_m, sequence
 from skyquilt.matching.fixed_marks import FindFixedMarks, FixedMarks
 from skyquilt.matching.lens_kind import fisheye_note, fisheyes, may_be_fisheye
 from skyquilt.matching.matchers import Guided
@@ -61,6 +62,10 @@ class ExpectedPlaces:
         return np.where((np.abs(places) < 1e6).all(1, keepdims=True), places, np.nan)
 
 
+APART = 0.1
+"""Where more photos than this share are not connected with most others, positions do not tell which
+overlap: cameras look to all sides, or positions are false. Those are asked for by their content.
+"""
 BATCH = 24
 """Most pairs of a stored artefact: those of one photo with later ones, which one worker matches."""
 
@@ -352,59 +357,45 @@ def marked_in(
 
 def _linked(linker: _Linker, workers: Workers) -> Steps[list[Link | RejectedLink]]:
     """Tries all pairs."""
-    found, methods, matched = linker.found, linker.methods, linker.batch
-    n, xy = len(found.photos), linker.xy
-    lost = [i for i in range(n) if not np.isfinite(xy[i]).all()]
-    # in order of capture, so that the features of a photo are read once for all its pairs
-    first = sorted({*sequence(n), *closest(linker.nearest(), n, 2)})
-    tried: list[Link | RejectedLink] = []
-    for batch in workers.each(matched, _batches(first)):
-        tried += batch
-        yield len(tried), 2 * len(first)
-    reach = overlap_reach_m([k for k in tried if isinstance(k, Link)], found, xy)
-    rest = linker.nearest(reach) if n > 2 else []
-    if lost and n > 2:
-        rest += methods.retrieval(found.features, None if len(lost) == n else lost)
-    done = set(first)
-    rest = sorted({p for p in rest if p not in done})
-    for batch in workers.each(matched, _batches(rest)):
-        tried += batch
-        yield len(tried), len(first) + len(rest)
+    found, methods, xy = linker.found, linker.methods, linker.xy
+    n, tried, done = len(found.photos), list[Link | RejectedLink](), set[Pair]()
     sizes = [(p.width, p.height) for p in found.photos]
+    lost = [i for i in range(n) if not np.isfinite(xy[i]).all()]
+
+    def compared(pairs: Iterable[Pair], share: float = 1.0) -> Steps[bool]:
+        """Tries pairs that were not yet, a share of all; whether any is a link."""
+        # in order of capture, so that the features of a photo are read once for all its pairs
+        new, before = sorted(set(pairs) - done), len(tried)
+        done.update(new)
+        for batch in workers.each(linker.batch, _batches(new)):
+            tried.extend(batch)
+            yield len(tried), round(len(done) / share)
+        return any(isinstance(k, Link) for k in tried[before:])
+
+    def links() -> list[Link]:
+        return [k for k in tried if isinstance(k, Link)]
+
+    yield from compared([*sequence(n), *closest(linker.nearest(), n, 2)], share=0.5)
+    if n > 2:
+        reach = overlap_reach_m(links(), found.features, sizes, xy)
+        rest = linker.nearest(reach)
+        if lost:
+            rest += methods.retrieval(found.features, None if len(lost) == n else lost)
+        yield from compared(rest)
+        block = blocks_of(n, links())
+        apart = np.flatnonzero(block != np.bincount(block).argmax()).tolist()
+        if len(apart) > APART * n:
+            yield from compared(methods.retrieval(found.features, apart))
     for _ in range(methods.through_others.rounds):
-        links = [k for k in tried if isinstance(k, Link)]
-        more = methods.through_others(links, found.features, sizes, {(k.a, k.b) for k in tried})
-        total = len(tried) + len(more)
-        for batch in workers.each(matched, _batches(more)):
-            tried += batch
-            yield len(tried), total
-        if not any(isinstance(k, Link) for k in tried[total - len(more) :]):
+        if not (yield from compared(methods.through_others(links(), found.features, sizes, done))):
             break
     return tried
 
 
-def overlap_reach_m(
-    links: Sequence[Link], found: FeaturedPhotos, xy: NDArray[np.float64]
-) -> float | None:
-    """Distance in m of positions beyond which photos hardly overlap, estimated from links; None if
-    there are too few.
-
-    A link gives the image shift in px, and the positions give it in m. Altitudes are not used.
-    """
-    metres_per_px, features = [], found.features
-    for link in links:
-        pa = features[link.a].px[link.index_a].mean(0)
-        pb = features[link.b].px[link.index_b].mean(0)
-        size = np.array([found.photos[link.a].width, found.photos[link.a].height])
-        a, b = pa - size / 2, pb - size / 2
-        moved = abs(link.b_S_a * complex(a[0], -a[1]) - complex(b[0], -b[1]))
-        apart = float(np.hypot(*(xy[link.a] - xy[link.b])))
-        if moved > 0.1 * size[0] and np.isfinite(apart) and apart > 0:
-            metres_per_px.append(apart / moved)
-    if len(metres_per_px) < 5:
-        return None
-    photo = found.photos[0]
-    return float(np.median(metres_per_px)) * 0.75 * max(photo.width, photo.height)
+def blocks_of(count: int, links: Sequence[Link]) -> NDArray[np.integer[Any]]:
+    """(count,) numbers of the groups of photos that links connect."""
+    a, b = (np.array([getattr(k, name) for k in links], np.int64) for name in ("a", "b"))
+    return connected(count, a, b)
 
 
 def _batches(pairs: Sequence[Pair]) -> list[Sequence[Pair]]:

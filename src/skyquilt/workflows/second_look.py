@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.tracks import connected
 from skyquilt.engine.clock import Steps
 from skyquilt.engine.store import Store, digest
 from skyquilt.engine.workers import Workers
@@ -24,7 +23,7 @@ from skyquilt.matching.matchers import Guided
 from skyquilt.model.features import Features, Link, RejectedLink, numbers
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Prior
-from skyquilt.workflows.links import Links, link_pair, marked_in, seen_as
+from skyquilt.workflows.links import Links, blocks_of, link_pair, marked_in, seen_as
 from skyquilt.workflows.methods import Countable, Methods
 from skyquilt.workflows.photo_features import PICTURE, FeaturedPhotos, GreyPictures, features_recipe
 
@@ -197,8 +196,7 @@ def unconnected(count: int, links: Links, priors: Sequence[Prior]) -> list[Pair]
     """Pairs that failed, of photos that links do not connect: for each photo outside the largest
     block those nearest to it.
     """
-    a, b = ([getattr(k, name) for k in links.links] for name in ("a", "b"))
-    block = connected(count, np.array(a, np.int64), np.array(b, np.int64))
+    block = blocks_of(count, links.links)
     largest = int(np.bincount(block).argmax()) if count else 0
     xy = np.array([p.map_C[:2] for p in priors]).reshape(-1, 2)
 
