@@ -1,17 +1,21 @@
 """Links are stored packed, and those of a survey as one artefact that a resumed run reads."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from skyquilt.engine.codec import decode, encode
+from skyquilt.matching.through_others import ThroughOthers
 from skyquilt.model.features import Link, RejectedLink, numbers
 from skyquilt.settings import MosaicSettings
 from skyquilt.workflows import links
 from skyquilt.workflows.artefacts import REGISTRY
 from skyquilt.workflows.links import PackedLinks, _Linker
 from skyquilt.workflows.mosaic import iter_mosaic, mosaic
+from tests.matching.test_through_others import SIZE, flown, linked, overlap, seen
 
 places = st.lists(st.integers(0, 70_000), max_size=6)
 found = st.lists(
@@ -52,6 +56,81 @@ def test_numbers_take_the_room_they_need(largest, kind):
     given = np.array([0, largest])
     assert numbers(given).dtype == kind and numbers(given).tolist() == given.tolist()
     assert numbers(np.zeros(0, np.int64)).dtype == np.uint16
+
+
+def looked_for(maps, reach=2, rounds=4):
+    """The pairs that are compared of photos (affine maps from the ground), whose positions tell of
+    neighbours in the order of capture only; and those that are links.
+    """
+    features, places = seen(maps)
+    n = len(maps)
+
+    def compared(pairs):
+        found = []
+        for a, b in pairs:
+            link = linked(a, b, places)
+            found.append(link if len(link) > 30 else RejectedLink(a=a, b=b, reason="few"))
+        return found
+
+    def alike(features, asked):
+        shown = {i: set(places[i].tolist()) for i in range(n)}
+        return [
+            (min(i, j), max(i, j))
+            for i in asked
+            for j in range(n)
+            if i != j and shown[i] & shown[j]
+        ]
+
+    linker = SimpleNamespace(
+        found=SimpleNamespace(
+            photos=[SimpleNamespace(width=SIZE[0], height=SIZE[1])] * n, features=features
+        ),
+        methods=SimpleNamespace(through_others=ThroughOthers(rounds=rounds), retrieval=alike),
+        xy=np.arange(n)[:, None] * [10.0, 0.0],
+        nearest=lambda reach_m=None: [(i, i + k) for k in range(1, reach) for i in range(n - k)],
+        batch=compared,
+    )
+    workers = SimpleNamespace(each=lambda do, parts: map(do, parts))
+    steps = links._linked(linker, workers)
+    counts = []
+    try:
+        while True:
+            counts.append(next(steps))
+    except StopIteration as end:
+        tried = end.value
+    assert all(done <= total for done, total in counts)
+    pairs = [(k.a, k.b) for k in tried]
+    assert len(set(pairs)) == len(pairs)
+    return pairs, {(k.a, k.b) for k in tried if isinstance(k, Link)}
+
+
+def test_photos_that_look_to_all_sides_are_compared_with_what_they_share():
+    """Neighbours in the order of capture hardly connect them; their true overlaps do."""
+    maps = flown(24, 5, spread=60.0)
+    n = len(maps)
+    shares = {(a, b): overlap(maps, a, b) for a in range(n) for b in range(a + 1, n)}
+    _, found = looked_for(maps)
+    near = {(i, i + 1) for i in range(n - 1)}
+    assert len(found & near) < n / 2 < 0.3 * len(found)
+    count = np.bincount(np.array(sorted(found)).ravel(), minlength=n)
+    missed = {
+        (a, b) for (a, b), s in shares.items() if s > 0.5 and (a, b) not in found
+    }  # not of photos that have links enough
+    assert all(max(count[a], count[b]) >= 8 for a, b in missed)
+    assert len(set(links.blocks_of(n, [linked(*p, seen(maps)[1]) for p in found]).tolist())) == 1
+
+
+def test_photos_that_positions_connect_are_asked_no_further():
+    """Each overlaps the next one by half and no other one by as much."""
+    step = SIZE[0] / 20
+    linear = np.eye(2) * 10
+    maps = [
+        np.column_stack([linear, np.array(SIZE) / 2 - linear @ (k * step - 150, 0.0)])
+        for k in range(8)
+    ]
+    pairs, found = looked_for(maps, reach=3)
+    assert sorted(pairs) == sorted({(i, i + k) for k in (1, 2) for i in range(8 - k)})
+    assert found == {(i, i + 1) for i in range(7)}
 
 
 @pytest.mark.slow
