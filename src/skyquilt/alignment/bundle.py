@@ -142,12 +142,12 @@ class Bundle:
         if lowered(found, begun.priors) is not begun.priors:
             notes += (LOWERED,)
         weak = weak_photos(found, begun.priors)
-        for _ in range(ASIDE_AGAIN if self.repair else 0):
+        for again in range(ASIDE_AGAIN if self.repair else 0):
             kept = kept_matches(found, features, links)
             more = found_oblique(found, weak, begun.priors, kept) - begun.aside
-            if not more:
-                break
             begun = replace(begun, aside=begun.aside | more)
+            if not more or (again and more <= found.rejected.keys() | weak.keys()):
+                break  # those bend the block no more
             found = adjust(begun)
             weak = weak_photos(found, begun.priors)
         own = taken(begun)

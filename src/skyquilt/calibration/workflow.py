@@ -147,25 +147,24 @@ def iter_calibrate(
             )
             figures = yield from clock.stage("report", work)
             yield from (Note(text=sentence) for sentence in open_)
-            yield Result(output=output, metrics=figures)
-            return
-        centres, corners = Calibrate(), Calibrate(marks="corners")
-        seen, by_centres, by_corners = yield from clock.stage(
-            "calibrate", _calibrated(seen, board, centres, corners)
-        )
-        yield from (Note(text=f"{r.name} was left out: {r.reason}") for r in seen.rejected)
-        _determined(by_centres)
-        judged = yield from clock.stage(
-            "judge",
-            calibrate_judging.judge(
-                seen.views, board, (centres, corners), (by_centres, by_corners)
-            ),
-        )
-        work = calibrate_files.finish(
-            output, seen, board, key, by_centres, by_corners, judged, clock, frames
-        )
-        figures = yield from clock.stage("report", work)
-        yield Result(output=output, metrics=figures)
+        else:
+            centres, corners = Calibrate(), Calibrate(marks="corners")
+            seen, by_centres, by_corners = yield from clock.stage(
+                "calibrate", _calibrated(seen, board, centres, corners)
+            )
+            yield from (Note(text=f"{r.name} was left out: {r.reason}") for r in seen.rejected)
+            _determined(by_centres)
+            judged = yield from clock.stage(
+                "judge",
+                calibrate_judging.judge(
+                    seen.views, board, (centres, corners), (by_centres, by_corners)
+                ),
+            )
+            work = calibrate_files.finish(
+                output, seen, board, key, by_centres, by_corners, judged, clock, frames
+            )
+            figures = yield from clock.stage("report", work)
+    yield Result(output=output, metrics=figures)
 
 
 def calibrate(

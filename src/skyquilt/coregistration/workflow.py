@@ -87,9 +87,9 @@ def iter_register(
                 yield Note(text=told.outcome.note)
             yield from _drawn(output, opened, told.outcome)
         _write(output, record, opened, told.outcome)
-        yield Result(output=output, metrics=record)
-        if isinstance(told.outcome, RefusedRegistration):
-            raise RefusedError(f"refused: {told.outcome.reason}")
+    yield Result(output=output, metrics=record)
+    if isinstance(told.outcome, RefusedRegistration):
+        raise RefusedError(f"refused: {told.outcome.reason}")
 
 
 def register(

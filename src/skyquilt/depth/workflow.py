@@ -117,7 +117,7 @@ def iter_depth(
         record = yield from clock.stage("draw", _drawn(output, route, scene, depth))
         record |= {"cpu_seconds": round(clock.cpu_total(), 2), "photos_total": total}
         write_text(output / "depth.json", json.dumps(record, indent=1, allow_nan=False) + "\n")
-        yield Result(output=output, metrics=record)
+    yield Result(output=output, metrics=record)
 
 
 def _enough(given: SurveyInput) -> None:

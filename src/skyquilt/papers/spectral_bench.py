@@ -76,7 +76,7 @@ def iter_spectral_bench(
         }
         write_text(output / "report.html", bench_page(record))
         write_text(output / "bench.json", json.dumps(record, indent=1, allow_nan=False) + "\n")
-        yield Result(output=output, metrics=record)
+    yield Result(output=output, metrics=record)
 
 
 def judged(pair: Pair, method: str) -> dict[str, Any]:
