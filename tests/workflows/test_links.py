@@ -58,7 +58,7 @@ def test_numbers_take_the_room_they_need(largest, kind):
     assert numbers(np.zeros(0, np.int64)).dtype == np.uint16
 
 
-def looked_for(maps, reach=2, rounds=4):
+def looked_for(maps, reach=2, rounds=4, xy=None):
     """The pairs that are compared of photos (affine maps from the ground), whose positions tell of
     neighbours in the order of capture only; and those that are links.
     """
@@ -86,7 +86,7 @@ def looked_for(maps, reach=2, rounds=4):
             photos=[SimpleNamespace(width=SIZE[0], height=SIZE[1])] * n, features=features
         ),
         methods=SimpleNamespace(through_others=ThroughOthers(rounds=rounds), retrieval=alike),
-        xy=np.arange(n)[:, None] * [10.0, 0.0],
+        xy=np.arange(n)[:, None] * [10.0, 0.0] if xy is None else xy,
         nearest=lambda reach_m=None: [(i, i + k) for k in range(1, reach) for i in range(n - k)],
         batch=compared,
     )
@@ -131,6 +131,22 @@ def test_photos_that_positions_connect_are_asked_no_further():
     pairs, found = looked_for(maps, reach=3)
     assert sorted(pairs) == sorted({(i, i + k) for k in (1, 2) for i in range(8 - k)})
     assert found == {(i, i + 1) for i in range(7)}
+
+
+def test_ground_that_looks_alike_far_away_is_not_compared():
+    """Two lines over the same pattern, 1 km or 20 m apart by their positions."""
+    half = np.eye(2) * 10
+    line = [
+        np.column_stack([half, np.array(SIZE) / 2 - half @ (k * 30.0 - 60, 0.0)]) for k in range(6)
+    ]
+    x = np.tile(np.arange(6) * 30.0, 2)
+    across = {}
+    for apart in (20.0, 1000.0):
+        xy = np.column_stack([x, np.repeat([0.0, apart], 6)])
+        pairs, _ = looked_for(line * 2, xy=xy)
+        across[apart] = {(a, b) for a, b in pairs if a < 6 <= b} - {(5, 6)}
+    assert {(k, k + 6) for k in range(6)} <= across[20.0]
+    assert not across[1000.0]
 
 
 @pytest.mark.slow

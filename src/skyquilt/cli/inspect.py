@@ -119,7 +119,9 @@ def sentences(survey: "Survey", findings: tuple[str, ...]) -> Iterator[str]:
         yield f"{len(survey.photos)} photos, {placed} with a position, {turned} with camera angles."
     if survey.clips:
         tracked = sum(c.track is not None for c in survey.clips)
-        yield f"{len(survey.clips)} videos, {tracked} with positions beside them."
+        count = len(survey.clips)
+        videos = "1 video" if count == 1 else f"{count} videos"
+        yield f"{videos}, {tracked} with positions beside them."
 
 
 def _cells(photo: "Photo") -> tuple[str, ...]:

@@ -64,7 +64,11 @@ class ExpectedPlaces:
 
 APART = 0.1
 """Where more photos than this share are not connected with most others, positions do not tell which
-overlap: cameras look to all sides, or positions are false. Those are asked for by their content.
+overlap: cameras look to all sides. Those are asked for by their content,
+"""
+ASIDE = 6.0
+"""within so many times the distance at which photos usually overlap: what looks alike farther away
+is other ground.
 """
 BATCH = 24
 """Most pairs of a stored artefact: those of one photo with later ones, which one worker matches."""
@@ -385,7 +389,9 @@ def _linked(linker: _Linker, workers: Workers) -> Steps[list[Link | RejectedLink
         block = blocks_of(n, links())
         apart = np.flatnonzero(block != np.bincount(block).argmax()).tolist()
         if len(apart) > APART * n:
-            yield from compared(methods.retrieval(found.features, apart))
+            alike = methods.retrieval(found.features, apart)
+            far = ASIDE * (reach or np.inf)
+            yield from compared(p for p in alike if not np.hypot(*(xy[p[0]] - xy[p[1]])) > far)
     for _ in range(methods.through_others.rounds):
         if not (yield from compared(methods.through_others(links(), found.features, sizes, done))):
             break
