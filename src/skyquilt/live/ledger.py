@@ -342,6 +342,11 @@ class Ledger:
             query = "delete from link where body is null and (a = ? or b = ?)"
             db.executemany(query, [(i, i) for i in photos])
 
+    def unlike(self, photo: int) -> list[tuple[int, int]]:
+        """Pairs of a photo and one before it that were compared and do not match."""
+        found = self.rows("select a, b from link where body is null and b = ?", photo)
+        return [(int(a), int(b)) for a, b in found]
+
     def compared(self, one: int, other: int) -> bool:
         """Whether two photos were compared, in any order."""
         pair = min(one, other), max(one, other)

@@ -113,21 +113,28 @@ class LiveLinks:
 
     def _compare_again(self, camera: str, *, marked: bool, bent: bool) -> None:
         """Links of a camera's photos anew, after marks were found on its pictures, on which they
-        may rest alone, or another kind of lens.
+        may rest alone, or another kind of lens. What did not match before may do so now: without
+        the matches of marks, which look like ground that repeats, or by the other lens.
         """
-        links = [(k.a, k.b, self._compared(k.a, k.b)) for k in self._of(camera)]
+        before = {(k.a, k.b) for k in self._of(camera)}
+        ids, again = self._ids(camera), set(before)
+        if marked:
+            again |= {p for i in ids for p in self.members.ledger.unlike(i) if ids.issuperset(p)}
+        links = [(a, b, self._compared(a, b)) for a, b in sorted(again)]
         with self.members.ledger.change():
             self.members.ledger.put_links(
                 [(a, b, None if k is None else link_bytes(k)) for a, b, k in links]
             )
             if marked:
                 self.marks.keep(camera)
-            if bent:  # what did not match by the other lens, may do so now
+            if bent:
                 self.members.save_fisheye(camera)
-                self.members.ledger.forget_unlike(self._ids(camera))
+                self.members.ledger.forget_unlike(ids)
         for a, b, link in links:
-            if link is None:
+            if link is None and (a, b) in before:
                 self.members.parted(a, b)
+            elif link is not None and (a, b) not in before:
+                self.members.joined(a, b)
 
     def links_among(
         self, ids: Iterable[int], touching: Collection[int] | None = None
