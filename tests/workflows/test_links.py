@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from skyquilt.alignment.tracks import blocks_of
 from skyquilt.engine.codec import decode, encode
 from skyquilt.matching.through_others import ThroughOthers
 from skyquilt.model.features import Link, RejectedLink, numbers
@@ -117,7 +118,7 @@ def test_photos_that_look_to_all_sides_are_compared_with_what_they_share():
         (a, b) for (a, b), s in shares.items() if s > 0.5 and (a, b) not in found
     }  # not of photos that have links enough
     assert all(max(count[a], count[b]) >= 8 for a, b in missed)
-    assert len(set(links.blocks_of(n, [linked(*p, seen(maps)[1]) for p in found]).tolist())) == 1
+    assert len(set(blocks_of(n, [linked(*p, seen(maps)[1]) for p in found]).tolist())) == 1
 
 
 def test_photos_that_positions_connect_are_asked_no_further():

@@ -8,7 +8,7 @@ import numpy as np
 
 from skyquilt.alignment.adjust import covariance, with_common_tilts
 from skyquilt.alignment.control import Control, hold_to_control, residuals_of_control
-from skyquilt.alignment.determined import weak_photos
+from skyquilt.alignment.determined import STATED_DEG, weak_photos
 from skyquilt.alignment.dominant_plane import levelled
 from skyquilt.alignment.enlarged import as_enlarged
 from skyquilt.alignment.equations import NearFactor
@@ -142,8 +142,9 @@ class Bundle:
         if lowered(found, begun.priors) is not begun.priors:
             notes += (LOWERED,)
         weak = weak_photos(found, begun.priors)
+        all_told = all(p.sigma_tilt_deg <= STATED_DEG for p in begun.priors)
         for again in range(ASIDE_AGAIN if self.repair else 0):
-            kept = kept_matches(found, features, links)
+            kept = {} if all_told else kept_matches(found, features, links)
             more = found_oblique(found, weak, begun.priors, kept) - begun.aside
             begun = replace(begun, aside=begun.aside | more)
             if not more or (again and more <= found.rejected.keys() | weak.keys()):

@@ -126,13 +126,13 @@ def found_oblique(
     """Photos without reported tilt that the adjustment turned far from the vertical with a loss of
     matches, that lost many, or that it could not hold; besides, those that it turned and moved far
     from what they report. None if most are. `weak`: those that are not determined; `kept`: shares
-    of their matches (`kept_matches`).
+    of the held photos' matches (`kept_matches`), not needed where all report their tilt.
     """
     linked = [*alignment.held, *alignment.rejected]
-    found = {i for i in alignment.held if kept[i] < FEW_KEPT}
+    found = {i for i in kept if kept[i] < FEW_KEPT}
     found |= {
         i
-        for i in alignment.held
+        for i in kept
         if kept[i] < MOST_KEPT and tilt_deg(alignment.poses[i].cam_R_map) > OBLIQUE_DEG
     }
     found |= alignment.rejected.keys() | weak.keys()

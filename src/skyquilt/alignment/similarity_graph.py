@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.tracks import connected, outwards, spanning_tree
+from skyquilt.alignment.tracks import blocks_of, outwards, spanning_tree
 
 DENSE = 300
 """Largest number of photos for which the normal equations are solved as a full matrix."""
@@ -72,9 +72,7 @@ class PlaneSolution:
 
 def components(count: int, links: Sequence[PlaneLink]) -> list[NDArray[np.int64]]:
     """Connected groups of photos, largest first (single photos included)."""
-    label = connected(
-        count, np.array([k.a for k in links], int), np.array([k.b for k in links], int)
-    )
+    label = blocks_of(count, links)
     groups = [np.flatnonzero(label == g) for g in range(label.max() + 1)]
     return sorted(groups, key=lambda g: (-len(g), int(g[0])))
 
@@ -237,9 +235,7 @@ def against_positions(
     if many:
         return []
     rest = [k for k, against in zip(links, far.tolist(), strict=True) if not against]
-    part = connected(
-        len(position), np.array([k.a for k in rest], int), np.array([k.b for k in rest], int)
-    )
+    part = blocks_of(len(position), rest)
     held = {end for k in rest for end in (k.a, k.b)}
     joined = Counter(frozenset((part[k.a], part[k.b])) for k in found)
 

@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,26 @@ from skyquilt.model.features import Features, Link
 Index = NDArray[np.int64]
 TOGETHER = 1_000_000
 """Edges or observations that are looked at at once."""
+
+
+class Ends(Protocol):
+    """A link, of whatever kind, of two photos."""
+
+    @property
+    def a(self) -> int:
+        """The first one."""
+        ...
+
+    @property
+    def b(self) -> int:
+        """The second one."""
+        ...
+
+
+def blocks_of(count: int, links: Sequence[Ends]) -> NDArray[np.integer[Any]]:
+    """(count,) numbers of the groups of photos that links connect, see `connected`."""
+    a, b = (np.array([getattr(k, name) for k in links], np.int64) for name in ("a", "b"))
+    return connected(count, a, b)
 
 
 def connected(count: int, a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.integer[Any]]:

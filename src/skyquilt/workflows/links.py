@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from skyquilt.alignment.oblique import looked_at
 from skyquilt.alignment.pose import ByPose
 from skyquilt.alignment.start import ground_of
-from skyquilt.alignment.tracks import connected
+from skyquilt.alignment.tracks import blocks_of
 from skyquilt.engine.clock import Steps
 from skyquilt.engine.free_memory import give_back_growth
 from skyquilt.engine.store import Store, digest
@@ -396,12 +396,6 @@ def _linked(linker: _Linker, workers: Workers) -> Steps[list[Link | RejectedLink
         if not (yield from compared(methods.through_others(links(), found.features, sizes, done))):
             break
     return tried
-
-
-def blocks_of(count: int, links: Sequence[Link]) -> NDArray[np.integer[Any]]:
-    """(count,) numbers of the groups of photos that links connect."""
-    a, b = (np.array([getattr(k, name) for k in links], np.int64) for name in ("a", "b"))
-    return connected(count, a, b)
 
 
 def _batches(pairs: Sequence[Pair]) -> list[Sequence[Pair]]:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.tracks import blocks_of
 from skyquilt.engine.clock import Steps
 from skyquilt.engine.store import Store, digest
 from skyquilt.engine.workers import Workers
@@ -23,7 +24,7 @@ from skyquilt.matching.matchers import Guided
 from skyquilt.model.features import Features, Link, RejectedLink, numbers
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Prior
-from skyquilt.workflows.links import Links, blocks_of, link_pair, marked_in, seen_as
+from skyquilt.workflows.links import Links, link_pair, marked_in, seen_as
 from skyquilt.workflows.methods import Countable, Methods
 from skyquilt.workflows.photo_features import PICTURE, FeaturedPhotos, GreyPictures, features_recipe
 
