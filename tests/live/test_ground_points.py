@@ -39,6 +39,20 @@ def test_what_lies_above_or_beyond_the_photos_goes():
     assert np.array_equal(found, good)
 
 
+@pytest.mark.parametrize("wrong", [59.4, -2000.0])
+def test_ground_that_was_taken_wrongly_does_not_refuse_the_right_one(wrong):
+    """Matches on a text had told ground just below the photos: what lies 60 m below them was
+    refused for good, and what links show was measured against ground at 59 m.
+    """
+    rng = np.random.default_rng(1)
+    ground = GROUND + rng.uniform(-5, 5, 300)
+    right = np.column_stack([rng.uniform(-30, 130, 300), rng.uniform(-60, 60, 300), ground])
+    rays = np.array([[40.0, 10, GROUND + 64], [-1300, -800, GROUND - 2000], [50, 10, GROUND - 900]])
+    assert not len(on_ground(right, poses(60.0), GROUND + wrong))
+    assert np.array_equal(on_ground(np.concatenate([right, rays]), poses(60.0), None), right)
+    assert not len(on_ground(rays[:1], poses(60.0), None))  # all of it above the photos
+
+
 def test_nothing_is_judged_without_photos():
     bad = np.array([[40.0, 10, GROUND + 64]])
     assert on_ground(bad, {}, GROUND) is bad
@@ -61,12 +75,11 @@ def test_ground_belongs_to_the_photos_that_are_nearest():
     refinement = object.__new__(Refinement)
     refinement.members = SimpleNamespace(on_map=lambda: shown)
     refinement.local_pose = SimpleNamespace(metadata=SimpleNamespace(heights=cells))
-    refinement.redraw = SimpleNamespace(canvas=SimpleNamespace(ground=GROUND))
     after = before | {5: Pose(cam_R_map=before[5].cam_R_map, map_C=before[5].map_C + [9, 0, 0])}
-    own, gone = refinement._ground_of(after)
+    own, gone = refinement._ground_of(after, GROUND)
     middle = (own + 0.5) * 4
     assert len(own) == (((known + 0.5) * 4)[:, 1] < 40).sum()
     assert (middle[:, 1] < 40).all()
     between = middle[:, 0] == 90
     assert np.array_equal(gone[~between], middle[~between, 0] > 90)
-    assert len(refinement._ground_of({})[0]) == 0
+    assert len(refinement._ground_of({}, GROUND)[0]) == 0

@@ -216,12 +216,15 @@ class Refinement:
     ) -> None:
         """Adds ground points (P, 3) in m of photos with these poses to the height cells (inside a
         transaction, before the photos are moved); `known`: they come from calibrated cameras;
-        `together`: from an adjustment that tells all ground of these photos anew.
+        `together`: from an adjustment that tells all ground of these photos anew; what was taken
+        for ground before, by matches on a text for instance, does not refuse it.
         """
-        xyz = on_ground(xyz, poses, self.redraw.canvas.ground)
+        xyz = on_ground(xyz, poses, None if together else self.redraw.canvas.ground)
         cells = self.local_pose.metadata.heights
-        together = together and len(xyz) > 0
-        touched, z = cells.renew(xyz, *self._ground_of(poses)) if together else cells.add(xyz)
+        if together and len(xyz):
+            touched, z = cells.renew(xyz, *self._ground_of(poses, float(np.median(xyz[:, 2]))))
+        else:
+            touched, z = cells.add(xyz)
         with self.ledger.change() as db:
             values = [
                 (c, r, height) for (c, r), height in zip(touched.tolist(), z.tolist(), strict=True)
@@ -237,9 +240,12 @@ class Refinement:
                 self.ledger.put_meta("ground", ground)
                 self.redraw.canvas.ground = ground
 
-    def _ground_of(self, poses: Mapping[int, Pose]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Cells (k, 2) with heights below photos that are about to get these poses, nearest to them
-        of all photos on the map; and whether their photo moves sideways by more than a cell.
+    def _ground_of(
+        self, poses: Mapping[int, Pose], ground: float
+    ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Cells (k, 2) with heights below photos that are about to get these poses, over ground at
+        about this height in m, nearest to them of all photos on the map; and whether their photo
+        moves sideways by more than a cell.
         """
         cells = self.local_pose.metadata.heights
         shown = [m for m in self.members.on_map() if m.pose is not None]
@@ -247,7 +253,7 @@ class Refinement:
         own = np.array([m.id in poses for m in shown], bool)
         if not own.any():
             return np.zeros((0, 2), np.int64), np.zeros(0, bool)
-        high = max(float(np.median(C[own, 2])) - self.redraw.canvas.ground, 1.0)
+        high = max(float(np.median(C[own, 2])) - ground, 1.0)
         low, top = C[own, :2].min(0) - MOST_ASIDE * high, C[own, :2].max(0) + MOST_ASIDE * high
         places = cells.places((low[0], low[1], top[0], top[1]))
         if not len(places):
@@ -373,18 +379,22 @@ class Refinement:
 
 
 def on_ground(
-    xyz: NDArray[np.float64], poses: Mapping[int, Pose], ground: float
+    xyz: NDArray[np.float64], poses: Mapping[int, Pose], ground: float | None
 ) -> NDArray[np.float64]:
     """Those of some points (P, 3) in m that can be ground under photos with these poses, over
-    ground at about this height in m; all of them where there are no poses. Rays that hardly
-    converge, of matches on a text in the pictures or towards a horizon, meet above the cameras or
-    far below and beside them.
+    ground at about this height in m (None: as far below them as the points are in the median); all
+    of them where there are no poses. Rays that hardly converge, of matches on a text in the
+    pictures or towards a horizon, meet above the cameras or far below and beside them.
     """
     if not poses or not len(xyz):
         return xyz
     C = np.array([pose.map_C for pose in poses.values()])
-    high = max(float(np.median(C[:, 2])) - ground, 1.0)
     away, at = nearest(C[:, :2], xyz[:, :2], 1)
-    below = (C[at[:, 0], 2] - xyz[:, 2]) / high
+    below = C[at[:, 0], 2] - xyz[:, 2]
+    if ground is None:
+        high = float(np.median(below[below > 0])) if (below > 0).any() else 1.0
+    else:
+        high = max(float(np.median(C[:, 2])) - ground, 1.0)
+    below = below / high
     near = (away[:, 0] < MOST_ASIDE * high) & (below > LEAST_BELOW) & (below < MOST_BELOW)
     return np.asarray(xyz[near])
