@@ -8,6 +8,8 @@ import pytest
 from skyquilt.alignment import outcome
 from skyquilt.alignment.determined import weak_photos
 from skyquilt.alignment.oblique import without_photos
+from skyquilt.alignment.start import FOCAL_NOTE
+from skyquilt.alignment.unfit_cameras import cut_notes, focal_notes, unfit_notes
 from tests.alignment.test_bundle import Flown
 
 OFF = np.array([24.0, -18.0, 0.0])
@@ -85,25 +87,31 @@ def test_nothing_is_told_of_cameras_whose_photos_were_all_left_out(block):
     other = "screen 2400x1080"
     (own,) = set(found.camera_of.values())
     told = replace(found.accuracy, focal_shares={own: 0.2, other: 0.9})
-    notes = tuple(
-        f"{begins} {rest}"
-        for key in (own, f"{other} 3mm", other)
-        for begins, rest in (
-            (f"{outcome.UNSETTLED} of {key}:", "it stays uncertain."),
-            (f"The photos of {key}", f"{outcome.NO_FIT}: so."),
-            (f"The photos of {key}", f"{outcome.SEEM}: so."),
-        )
-    )
+    keys = (own, f"{other} 3mm", other)
     found = replace(
         found,
         camera_of={**found.camera_of, 1: other},
-        cameras={**found.cameras, other: found.cameras[own]},
+        cameras=dict.fromkeys(keys, found.cameras[own]),
         accuracy=told,
-        notes=notes,
     )
+    notes = tuple(
+        note
+        for key in keys
+        for note in (
+            f"{outcome.UNSETTLED} of {key}: it stays uncertain.",
+            f"The photos of {key} {outcome.NO_FIT}: so.",
+            f"The photos of {key} {outcome.SEEM}: so.",
+            *unfit_notes(found, {key}),
+            *cut_notes(found, {key}),
+            *focal_notes(found, {key: 2.0}),
+            FOCAL_NOTE.format(key, 900.0),
+        )
+    )
+    assert len(notes) == 21
+    found = replace(found, notes=notes)
     assert outcome.of_placed(found) is found
     left = outcome.of_placed(without_photos(found, {1: "a screenshot"}))
-    assert left.notes == notes[:6]
+    assert left.notes == notes[:14]
     assert left.accuracy.focal_share == 0.2 and found.accuracy.focal_share == 0.9
 
 

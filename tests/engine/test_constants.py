@@ -46,6 +46,9 @@ IN_NO_KEY = {
         ("SIGMA_YAW_DEG", "SIGMA_COURSE_DEG"),
         "repaired metadata are in the key of the alignment, by value",
     ),
+    **dict.fromkeys(
+        ("SITES_APART_M", "SITES_LISTED"), "places far from one another are told, no more"
+    ),
     "YAW_DEG": "conflicts are told in the report and shape nothing",
     "_EPOCH": "where weeks of GPS begin; positions are in keys by value",
     "CERTAIN": "conflicts are told in the report and shape nothing",

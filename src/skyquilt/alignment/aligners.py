@@ -12,8 +12,9 @@ from skyquilt.alignment.addition import added, median_offset
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.control import control_in_frame
 from skyquilt.alignment.copied_views import without_copied_views
-from skyquilt.alignment.crowded_positions import at_their_middle, one_place_notes, without_crowded
+from skyquilt.alignment.crowded_positions import at_their_middle, one_place_notes
 from skyquilt.alignment.determined import ground_places
+from skyquilt.alignment.foreign_positions import usable_positions
 from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.motion import FEWEST_HEADED, headings_by_course
 from skyquilt.alignment.oblique import tilted, without_photos
@@ -68,7 +69,7 @@ class ByLinks:
 
     bundle: Bundle = field(default_factory=Bundle)
     """The adjustment."""
-    version: ClassVar[int] = 16
+    version: ClassVar[int] = 17
     needs_links: ClassVar[bool] = True
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -77,7 +78,7 @@ class ByLinks:
         Raises:
             AlignmentError: no two photos are linked.
         """
-        inputs, said = without_crowded(inputs)
+        inputs, said = usable_positions(inputs)
         if inputs.former is not None and (grown := added(inputs, self.bundle)) is not None:
             return of_placed(without_strange_blocks(with_loose_photos(grown, inputs), inputs))
         control = control_in_frame(inputs.control, inputs.photos, inputs.frame)
@@ -156,7 +157,7 @@ class Auto:
     """For linked photos."""
     pose: ByReport
     """For photos that only have positions."""
-    version: ClassVar[int] = 15
+    version: ClassVar[int] = 16
     needs_links: ClassVar[bool] = True
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -165,7 +166,7 @@ class Auto:
         Raises:
             AlignmentError: photos without links and without positions.
         """
-        inputs, said = without_crowded(inputs)
+        inputs, said = usable_positions(inputs)
         positions = sum(bool(np.isfinite(p.map_C[:2]).all()) for p in inputs.priors)
         control = sum(not point.check for point in inputs.control)
         blank = () if inputs.links else blank_notes(inputs.features)

@@ -79,7 +79,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 76
+    version: ClassVar[int] = 77
 
     def __call__(
         self,
@@ -317,14 +317,17 @@ def sharpened(
 
 
 def _nowhere(start: Start) -> dict[int, str]:
-    """Photos of blocks whose place is not known: neither links with the largest block nor positions
-    tell it. Drawn anyway, they would lie across the map wherever their start put them.
+    """Photos of blocks whose place is not known: positions do not tell it, nor links with those
+    that they place, or with the largest where they place none. Drawn anyway, they would lie across
+    the map wherever their start put them.
     """
-    first, *others = sorted(start.blocks, key=len, reverse=True)
-    lost = [b for b in others if not start.georeferenced.intersection(b)]
+    blocks = sorted(start.blocks, key=len, reverse=True)
+    known = [b for b in blocks if start.georeferenced.intersection(b)] or blocks[:1]
+    lost = [b for b in blocks if b not in known]
+    of = "the largest block" if known[0] == blocks[0] else "those that positions place"
     return {
-        i: f"it is linked with {len(block) - 1} other photos, but not with the {len(first)} of the"
-        " largest block, and without a usable position its place is not known"
+        i: f"it is linked with {len(block) - 1} other photos, but not with the {len(known[0])} of"
+        f" {of}, and without a usable position its place is not known"
         for block in lost
         for i in block
     }

@@ -39,6 +39,15 @@ SEEM = "seem to be stretched"
 """Words of the note of a camera whose ratio of focal lengths is far off."""
 NO_FIT = "do not fit a camera as it is taken for"
 """Words of the note of a camera whose residuals correlate so."""
+OF_CAMERA = (
+    UNSETTLED + " of {0}: ",
+    "The photos of {0} " + SEEM,
+    "The photos of {0} do not fit ",
+    "The optical axis of {0} meets ",
+    "Files do not tell the focal length of {0}, ",
+    "No file tells the focal length of {0}: ",
+)
+"""How notes on one camera begin, {0} its name."""
 
 
 def leave_one_out(
@@ -223,14 +232,7 @@ def of_placed(found: Alignment) -> Alignment:
     idle = {key.removesuffix(TURNED) for key in found.camera_of.values()} - used
     if not idle:
         return found
-    begins = tuple(
-        start
-        for key in idle
-        for start in (
-            f"{UNSETTLED} of {key}: ",
-            *(f"The photos of {key} {words}" for words in (SEEM, NO_FIT)),
-        )
-    )
+    begins = tuple(start.format(key) for key in idle for start in OF_CAMERA)
     told = found.accuracy
     if told is not None:
         shares = {key: share for key, share in told.focal_shares.items() if key not in idle}

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from skyquilt.alignment.aligners import placed
 from skyquilt.alignment.conflicts import priors_taken
+from skyquilt.alignment.far_sites import with_site_notes
 from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.motion import speeds_of
 from skyquilt.alignment.priors import priors
@@ -198,12 +199,11 @@ def align_photos(
     links.make_room()
     yield from (Note(text=n, warning=True) for n in alignment.notes)
     names, cameras = ([p.name for p in found.photos], [p.camera_key for p in found.photos])
-    speeds = speeds_of(found.photos)
     return AlignedPhotos(
         given=given,
         found=found,
         frame=frame,
-        priors=priors_taken(alignment, frame, reported, names, cameras, speeds),
+        priors=priors_taken(alignment, frame, reported, names, cameras, speeds_of(found.photos)),
         links=links,
         order=tuple(known.order),
         alignment=alignment,
@@ -427,4 +427,4 @@ def _align(known: AlignmentInputs, key: str, methods: Methods, clock: Clock) -> 
 
     alignment = yield from apart(aligned, AdjustmentSteps())
     store.forget([ADJUSTING])
-    return alignment
+    return with_site_notes(alignment, [p.name for p in known.photos])
