@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from skyquilt.alignment import repairs
 from skyquilt.alignment.outcome import ASPECT, NO_FIT
 from skyquilt.alignment.problem import READOUT
 from skyquilt.alignment.setup import priors_by_camera, set_up
@@ -25,7 +26,7 @@ from skyquilt.alignment.unfit_cameras import (
 )
 from skyquilt.model.camera import Camera
 from skyquilt.model.photo import Focal, Shutter
-from tests.alignment.surveys import FOCAL, HEIGHT, WIDTH, alignment, photo
+from tests.alignment.surveys import FOCAL, HEIGHT, WIDTH, alignment, photo, prior
 from tests.alignment.test_bundle import Flown
 
 UNKNOWN = Shutter(readout_s=0.0, sigma_s=0.010, source="unknown")
@@ -148,6 +149,42 @@ def test_only_principal_points_of_these_cameras_are_loosened(setup_of):
 )  # fmt: skip
 def test_where_the_axis_meets_is_told(cx, cy, said):
     assert said in cut_notes(found_at(cx, cy), {"cam"})[0]
+
+
+def flown_as(find):
+    """A survey whose adjustment finds principal points by what it is begun with."""
+    priors = priors_by_camera([photo(f"{i}.jpg") for i in range(8)], "full")
+    return repairs.Survey(
+        names=[], cameras=[], speeds=None, linked=8, adjust=find, guess=None, beginnings=None,
+        unfit=lambda t: frozenset(), focals=lambda t: ({}, True),
+        cut=lambda t: cut_cameras(t.found, priors),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("slanting", [True, False])
+def test_principal_points_that_stood_for_tilts_are_held_again(slanting, monkeypatch):
+    """Photos that look ahead, begun as if they looked down, show the axis far above the picture.
+    Those that were cut off show it so wherever they look.
+    """
+
+    def find(begun):
+        off = (begun.guess is None or not slanting) and (110.0 if begun.cut else 30.0)
+        return found_at((WIDTH - 1) / 2, (HEIGHT - 1) / 2 - off)
+
+    def guessed(last, survey):
+        return survey.tried(last.begun, guess=last.begun.priors)
+
+    monkeypatch.setattr("skyquilt.alignment.enlarged.misfit_px", lambda found: 1.0)
+    monkeypatch.setattr("skyquilt.alignment.unfit_cameras.misfit_px", lambda found: 1.0)
+    monkeypatch.setattr(repairs, "fits_cut", lambda *both: True)
+    wanted = ("_cut_pictures", "_held_in_the_middle")
+    cut, held = (r for name in wanted for r in repairs.REPAIRS if r.__name__ == name)
+    monkeypatch.setattr(repairs, "REPAIRS", (cut, guessed, held))
+    survey = flown_as(find)
+    begun = repairs.Beginning(priors=[prior((0.0, 0.0, 60.0))] * 8)
+    last = repairs.repaired(repairs.Tried(found=find(begun), begun=begun), survey)
+    assert last.begun.cut == (set() if slanting else {"cam"})
+    assert last.notes == (() if slanting else cut_notes(last.found, {"cam"}))
 
 
 @pytest.fixture

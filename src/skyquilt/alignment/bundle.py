@@ -22,13 +22,14 @@ from skyquilt.alignment.oblique_guess import LOWERED, guessed_priors, lowered
 from skyquilt.alignment.oblique_start import NO_BEGINNINGS, beginnings, reported_start, slanting
 from skyquilt.alignment.outcome import accuracy, ground_points, leave_one_out, misfits, undetermined
 from skyquilt.alignment.problem import Problem, State
-from skyquilt.alignment.repairs import Beginning, Survey, Tried, begun_with, repaired
+from skyquilt.alignment.repairs import begun_with, repaired
 from skyquilt.alignment.setup import Setup, camera_records, pose_records, priors_by_camera, set_up
 from skyquilt.alignment.stages import fine_steps, plain, rough_steps, settled, weighed
 from skyquilt.alignment.start import Start, find_start, focals_by_heights, ground_of, with_focals
 from skyquilt.alignment.told_poses import believe_told
 from skyquilt.alignment.tracks import Thinning, Tracks, build_tracks, thin
 from skyquilt.alignment.triangulate import triangulated
+from skyquilt.alignment.tries import Beginning, Survey, Tried
 from skyquilt.alignment.unfit_cameras import (
     CameraPriors,
     cut_cameras,
@@ -79,7 +80,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 77
+    version: ClassVar[int] = 78
 
     def __call__(
         self,

@@ -230,7 +230,7 @@ def priors_taken(
     speeds: Speeds,
 ) -> tuple[Prior, ...]:
     """The reported priors as an alignment took them, by what it says of them; `frame`: that of the
-    reported ones, the rest as of `alignment.repairs.Survey`.
+    reported ones, the rest as of `alignment.tries.Survey`.
     """
     priors = lowered(found, believed(found, frame, reported))
     moved = as_moved(found, priors, cameras, speeds)

@@ -4,8 +4,8 @@ Each repair judges what files tell by an adjustment, adjusts again with what it 
 takes that only where it fits better. They follow one another in the order of `REPAIRS`.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 from skyquilt.alignment.determined import STATED_DEG
@@ -13,7 +13,6 @@ from skyquilt.alignment.displaced_parts import brought_together, outvoted, place
 from skyquilt.alignment.enlarged import enlarged_note, enlarged_photos, fits_better
 from skyquilt.alignment.false_tilts import common_tilts, leaning_lines, off_told, told_no_tilt
 from skyquilt.alignment.late_positions import mirrored, moved_note, on_time, unshifted
-from skyquilt.alignment.motion import Speeds
 from skyquilt.alignment.oblique import reported_oblique, tilted, turned_deg, without_photos
 from skyquilt.alignment.oblique_guess import (
     LOOK_DOWN,
@@ -28,7 +27,6 @@ from skyquilt.alignment.oblique_guess import (
     taken_to_look_down,
 )
 from skyquilt.alignment.oblique_start import (
-    Beginnings,
     aslant,
     nearer,
     off_positions,
@@ -36,6 +34,7 @@ from skyquilt.alignment.oblique_start import (
     turned_priors,
     untold,
 )
+from skyquilt.alignment.tries import Beginning, Survey, Tried
 from skyquilt.alignment.unfit_cameras import (
     cut_notes,
     fits_as_well,
@@ -69,78 +68,6 @@ FOCALS_AGAIN = 6
 """
 
 
-@dataclass(frozen=True, kw_only=True)
-class Beginning:
-    """What an adjustment is begun with."""
-
-    priors: Sequence[Prior]
-    """What files tell of the photos, as far as it is believed."""
-    guess: Sequence[Prior] | None = None
-    """The same with guessed directions of the cameras."""
-    aside: frozenset[int] = frozenset()
-    """Photos that are not adjusted, but hung on the others afterwards."""
-    enlarged: Mapping[int, float] = field(default_factory=dict)
-    """Factors of photos that are enlarged against others of their camera."""
-    focals: Mapping[str, float] = field(default_factory=dict)
-    """Factors of guessed focal lengths, by camera."""
-    loose: frozenset[str] = frozenset()
-    """Cameras whose shutters and aspect ratios pictures alone tell."""
-    cut: frozenset[str] = frozenset()
-    """Cameras whose principal points pictures alone tell."""
-    in_space: Beginnings | None = None
-    """Photos begin where they report to be, as those of an oblique survey do, or else here; None:
-    where links of photos that look down put them.
-    """
-    name: str = ""
-    """Tells parts of this adjustment that are kept from those of others."""
-
-    @property
-    def told(self) -> Sequence[Prior]:
-        """The priors of the adjustment."""
-        return self.priors if self.guess is None else self.guess
-
-
-@dataclass(frozen=True, kw_only=True)
-class Tried:
-    """An adjustment and its beginning."""
-
-    found: Alignment
-    begun: Beginning
-    notes: tuple[str, ...] = ()
-    """What is said of the repairs that it has."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Survey:
-    """What repairs know of the survey, and may ask."""
-
-    names: Sequence[str]
-    """File names of the photos, in order of capture."""
-    cameras: Sequence[str]
-    """Names of their cameras."""
-    speeds: Speeds
-    """Velocities of the photos where they are placed."""
-    linked: int
-    """How many photos have links."""
-    adjust: Callable[[Beginning], Alignment]
-    """Adjusts the survey."""
-    unfit: Callable[[Tried], frozenset[str]]
-    """Names of cameras that photos contradict (`unfit_cameras`)."""
-    cut: Callable[[Tried], frozenset[str]]
-    """Names of those whose photos may have been cut off (`cut_cameras`)."""
-    focals: Callable[[Tried], tuple[Mapping[str, float], bool]]
-    """Factors of guessed focal lengths that may be others (`other_focals`)."""
-    beginnings: Callable[[Tried], Beginnings]
-    """Where photos begin in space (`oblique_start.beginnings`)."""
-    guess: Callable[[Tried], Sequence[Prior] | None]
-    """Priors with directions with which matched rays meet clearly better; None without any."""
-
-    def tried(self, begun: Beginning, **changes: Any) -> Tried:
-        """The adjustment begun so, with changes."""
-        changed = replace(begun, **changes)
-        return Tried(found=self.adjust(changed), begun=changed)
-
-
 def begun_with(priors: Sequence[Prior], survey: Survey, *, repair: bool) -> Tried:
     """The first adjustment, with what files tell; oblique photos are kept aside for `repair`.
 
@@ -159,10 +86,15 @@ def begun_with(priors: Sequence[Prior], survey: Survey, *, repair: bool) -> Trie
 
 
 def repaired(first: Tried, survey: Survey) -> Tried:
-    """The adjustment with all repairs that fit better than what was there before."""
+    """The adjustment with all repairs that fit better than what was there before. What is told of
+    cameras is what the last of them found.
+    """
     for repair in REPAIRS:
         first = repair(first, survey)
-    return first
+    begun, found = first.begun, first.found
+    cut, loose = (cameras & found.cameras.keys() for cameras in (begun.cut, begun.loose))
+    said = (*cut_notes(found, cut), *unfit_notes(found, loose))
+    return replace(first, notes=(*first.notes, *said))
 
 
 def _guessed_focals(last: Tried, survey: Survey) -> Tried:
@@ -253,7 +185,16 @@ def _enlargements(last: Tried, survey: Survey) -> Tried:
 def _cut_pictures(last: Tried, survey: Survey) -> Tried:
     """Principal points of photos that were cut off are told by these alone."""
     cameras = survey.cut(last)
-    return _freed(last, survey, cameras, fits_cut, cut_notes, cut=cameras, name="cut ")
+    return _freed(last, survey, cameras, fits_cut, cut=cameras, name="cut ")
+
+
+def _held_in_the_middle(last: Tried, survey: Survey) -> Tried:
+    """Principal points that took the place of tilts are held again where photos were found to look
+    elsewhere since, and lie in the middle then.
+    """
+    cut = last.begun.cut
+    false = cut - survey.cut(last) if last.begun.guess is not None else frozenset[str]()
+    return _freed(last, survey, false, fits_as_well, cut=cut - false, name="uncut ")
 
 
 def _mirrored_positions(last: Tried, survey: Survey) -> Tried:
@@ -364,7 +305,7 @@ def _found_directions(last: Tried, survey: Survey) -> Tried:
 def _unfit_cameras(last: Tried, survey: Survey) -> Tried:
     """Shutters and aspect ratios that pictures contradict are told by these alone."""
     cameras = survey.unfit(last)
-    return _freed(last, survey, cameras, fits_as_well, unfit_notes, loose=cameras, name="unfit ")
+    return _freed(last, survey, cameras, fits_as_well, loose=cameras, name="unfit ")
 
 
 def _displaced_parts(last: Tried, survey: Survey) -> Tried:
@@ -386,16 +327,15 @@ def _freed(
     survey: Survey,
     cameras: frozenset[str],
     fits: Callable[[Alignment, Alignment], bool],
-    notes: Callable[[Alignment, frozenset[str]], tuple[str, ...]],
     **changes: Any,
 ) -> Tried:
-    """The adjustment with changes that free some cameras, where there are any and it `fits`."""
+    """The adjustment with changes that free or hold some cameras, where there are any and it
+    `fits`.
+    """
     if not cameras:
         return last
     other = survey.tried(last.begun, **changes)
-    if not fits(other.found, last.found):
-        return last
-    return replace(other, notes=(*last.notes, *notes(other.found, cameras)))
+    return replace(other, notes=last.notes) if fits(other.found, last.found) else last
 
 
 def _if_nearer(
@@ -423,6 +363,7 @@ REPAIRS: tuple[Callable[[Tried, Survey], Tried], ...] = (
     _false_tilts,
     _guessed_directions,
     _found_directions,
+    _held_in_the_middle,
     _unfit_cameras,
     _displaced_parts,
 )
