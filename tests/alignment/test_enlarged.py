@@ -70,6 +70,18 @@ def test_groups_are_those_that_were_made():
         assert all(found[i] == pytest.approx(each[i], rel=0.04) for i in found)
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_heights_that_scatter_tell_a_zoom_by_their_means(seed):
+    """Heights of a receiver, good to 6 m: no groups of their own. Two flights are none, either."""
+    names, each = ["A"] * len(LINES), np.resize([1.0, 1.4], len(LINES))
+    noise = np.random.default_rng(seed).normal(0, 0.4, len(LINES))
+    lower = np.column_stack([LINES[:, :2], LINES[:, 2] / each + noise])
+    found = enlarged_photos(block(lower), names, told_at(LINES, 6.0, seed))
+    assert found.keys() == set(np.flatnonzero(each > 1))
+    assert all(found[i] == pytest.approx(1.4, rel=0.12) for i in found)
+    assert not enlarged_photos(block(lower), names, told_at(lower, 6.0, seed))
+
+
 @pytest.mark.parametrize("kind", ["level", "drift", "told", "few", "no ties", "another camera"])
 def test_what_is_no_group(kind):
     """Among them flights of two heights that files tell, and drifting heights in files."""

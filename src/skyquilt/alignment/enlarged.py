@@ -4,7 +4,7 @@ crops. Taken for one camera's, they look like lower flights, and relief bends th
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,10 @@ APART = 1.1
 CALM = 0.25
 """Scatter within each group, as a share of the logarithm of that factor, at most; evenly spread
 heights have 0.29.
+"""
+CONTRADICTED = 5.0
+"""Means of heights told that differ by so many of their deviations from those of the adjustment
+contradict these.
 """
 MOST_GROUPS, GAPS = 4, 12
 """Groups of a camera at most, and the largest gaps between its heights that may divide them."""
@@ -50,8 +54,9 @@ def enlarged_photos(
     found: Alignment, cameras: Sequence[str], priors: Sequence[Prior]
 ) -> dict[int, float]:
     """The factor by which each photo (index) looks enlarged against the least enlarged ones of its
-    camera; only of those that do. Heights by the adjustment, over those told where most photos tell
-    theirs, fall into groups then. `cameras`: names, of each photo.
+    camera; only of those that do. Heights by the adjustment fall into groups then that those told
+    contradict, where most photos tell theirs, or those over these do. `cameras`: names, of each
+    photo.
     """
     if not len(found.ties.xyz):
         return {}
@@ -66,8 +71,10 @@ def enlarged_photos(
             ratio = np.array([height[i] for i in own])
         if len(own) < 2 * FEWEST or any(found.camera(i).fisheye for i in own):
             continue
-        group = _groups(np.log(ratio))
-        if _loose(np.log([height[i] for i in own]), group):
+        alone = np.log([height[i] for i in own])
+        group = _told_alike(np.log(ratio), _groups(alone))
+        group = group if group.any() else _groups(np.log(ratio))
+        if _loose(alone, group):
             continue
         middle = [float(np.median(ratio[group == k])) for k in range(group.max() + 1)]
         factors |= {i: middle[-1] / middle[k] for i, k in zip(own, group.tolist(), strict=True)}
@@ -141,6 +148,19 @@ def _groups(values: NDArray[np.float64]) -> NDArray[np.int64]:
             group[order] = np.searchsorted(best, np.arange(len(values)), side="left")
             return group
     return np.zeros(len(values), np.int64)
+
+
+def _told_alike(ratios: NDArray[np.float64], group: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Groups of heights by the adjustment, where those told contradict each step from one to the
+    next (`ratios`: logarithms of one over the other): they scatter too much to form groups
+    themselves, but their means do not. All 0 otherwise: flights at several heights.
+    """
+    parts = [ratios[group == k] for k in range(int(group.max()) + 1)]
+    for low, high in pairwise(parts):
+        error = np.hypot(low.std(ddof=1) / len(low) ** 0.5, high.std(ddof=1) / len(high) ** 0.5)
+        if not high.mean() - low.mean() > max(np.log(APART), CONTRADICTED * error):
+            return np.zeros_like(group)
+    return group
 
 
 def _loose(values: NDArray[np.float64], group: NDArray[np.int64]) -> bool:
