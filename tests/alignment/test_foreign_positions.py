@@ -50,12 +50,12 @@ def test_one_photo_without_links_places_no_block():
 
 def test_as_many_photos_of_another_place_are_the_map():
     """And the block whose place nothing tells is left out: it would lie anywhere."""
-    beside = [*ASIDE, *((x, 78.0, 45.0, 20.0, 0.0) for x in (-60, -42, -24, -6))]
-    given = two_places(told=range(10, 18), beside=beside)
+    beside = [(x, y, 45.0, 20.0, 0.0) for y in (60, 78) for x in (-60, -42, -24, -6, 12)]
+    given = two_places(told=range(10, 20), beside=beside)
     assert without_foreign(given) == (given, ())
     found = aligned(given)
-    assert found.frame.crs and set(found.poses) == set(range(10, 18))
-    assert "not with the 8 of those that positions place" in found.rejected[0]
+    assert found.frame.crs and set(found.poses) == set(range(10, 20))
+    assert "not with the 10 of those that positions place" in found.rejected[0]
 
 
 def test_positions_of_the_largest_block_and_control_points_place_the_map():

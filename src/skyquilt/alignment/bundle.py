@@ -17,7 +17,7 @@ from skyquilt.alignment.kept_matches import kept_matches
 from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
 from skyquilt.alignment.motion import speeds_of
 from skyquilt.alignment.near_positions import told_besides
-from skyquilt.alignment.oblique import found_oblique, hung, tilts_reported
+from skyquilt.alignment.oblique import contradicting, found_oblique, hung, tilts_reported
 from skyquilt.alignment.oblique_guess import LOWERED, guessed_priors, lowered
 from skyquilt.alignment.oblique_start import NO_BEGINNINGS, beginnings, reported_start, slanting
 from skyquilt.alignment.outcome import accuracy, ground_points, leave_one_out, misfits, undetermined
@@ -80,7 +80,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 79
+    version: ClassVar[int] = 80
 
     def __call__(
         self,
@@ -145,7 +145,8 @@ class Bundle:
         weak = weak_photos(found, begun.priors)
         all_told = all(p.sigma_tilt_deg <= STATED_DEG for p in begun.priors)
         for again in range(ASIDE_AGAIN if self.repair else 0):
-            kept = {} if all_told else kept_matches(found, features, links)
+            asked = not all_told or contradicting(found, begun.priors)
+            kept = kept_matches(found, features, links) if asked else {}
             more = found_oblique(found, weak, begun.priors, kept) - begun.aside
             begun = replace(begun, aside=begun.aside | more)
             if not more or (again and more <= found.rejected.keys() | weak.keys()):

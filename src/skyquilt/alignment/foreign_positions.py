@@ -13,11 +13,6 @@ from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.tracks import blocks_of
 from skyquilt.photos.side_rows import sentence_of
 
-FEW = 0.5
-"""Photos with such positions, and those linked with them, are fewer than this share of the largest
-block; where there are more, the map shows these, and the largest block is left out.
-"""
-
 
 def usable_positions(inputs: AlignmentInputs) -> tuple[AlignmentInputs, tuple[str, ...]]:
     """The inputs without positions that crowd, and without those of other places than the largest
@@ -29,8 +24,9 @@ def usable_positions(inputs: AlignmentInputs) -> tuple[AlignmentInputs, tuple[st
 
 
 def without_foreign(inputs: AlignmentInputs) -> tuple[AlignmentInputs, tuple[str, ...]]:
-    """The inputs without positions where only a few photos report any that are not linked with the
-    largest block, and a sentence on these; the very same inputs otherwise.
+    """The inputs without positions where only photos report any that are not linked with the
+    largest block, and fewer, with those linked with them, than it has; and a sentence on these. The
+    very same inputs otherwise.
     """
     if not inputs.links or inputs.frame.crs is None or inputs.former is not None:
         return inputs, ()
@@ -40,7 +36,7 @@ def without_foreign(inputs: AlignmentInputs) -> tuple[AlignmentInputs, tuple[str
     told = np.array([bool(np.isfinite(p.map_C[:2]).all()) for p in inputs.priors])
     first = block == np.bincount(block).argmax()
     others = np.isin(block, block[told])
-    if told[first].any() or not 0 < others.sum() < FEW * first.sum():
+    if told[first].any() or not 0 < others.sum() < first.sum():
         return inputs, ()
     names = sentence_of([inputs.photos[i].name for i in np.flatnonzero(told).tolist()])
     note = (

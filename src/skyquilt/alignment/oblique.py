@@ -125,8 +125,9 @@ def found_oblique(
 ) -> frozenset[int]:
     """Photos without reported tilt that the adjustment turned far from the vertical with a loss of
     matches, that lost many, or that it could not hold; besides, those that it turned and moved far
-    from what they report. None if most are. `weak`: those that are not determined; `kept`: shares
-    of the held photos' matches (`kept_matches`), not needed where all report their tilt.
+    from what they report with such a loss: without one, they report falsely. None if most are.
+    `weak`: those that are not determined; `kept`: shares of the held photos' matches
+    (`kept_matches`), not needed where all report their tilt and none is moved so.
     """
     linked = [*alignment.held, *alignment.rejected]
     found = {i for i in kept if kept[i] < FEW_KEPT}
@@ -137,8 +138,13 @@ def found_oblique(
     }
     found |= alignment.rejected.keys() | weak.keys()
     guessed = {i for i in found if priors[i].sigma_tilt_deg > STATED_DEG}
-    guessed |= {i for i in alignment.held if _contradicts(alignment.poses[i], priors[i])}
+    guessed |= {i for i in contradicting(alignment, priors) if kept[i] < MOST_KEPT}
     return frozenset(guessed if len(guessed) <= MOST_OBLIQUE * len(linked) else ())
+
+
+def contradicting(alignment: Alignment, priors: Sequence[Prior]) -> frozenset[int]:
+    """Held photos that look and lie far from where they report."""
+    return frozenset(i for i in alignment.held if _contradicts(alignment.poses[i], priors[i]))
 
 
 def hung(
