@@ -96,3 +96,6 @@ def test_the_accuracy_is_that_of_the_ground_that_the_map_shows():
     nowhere = accuracy_figures(told, ~np.ones((20, 20), bool), grid)
     assert nowhere["horizontal_m"]["worst"] == 9000  # a map without a point is told of all
     assert accuracy_figures(None, seen, grid) is None
+    assert (found["shared_horizontal_m"], found["shared_vertical_m"]) == (1.5, 3.0)
+    unplaced = accuracy_figures(told, seen, grid, placed=False)  # positions err, but it has none
+    assert unplaced == found | {"shared_horizontal_m": None, "shared_vertical_m": None}

@@ -135,10 +135,10 @@ def shutter_figures(photos: Sequence[Photo], alignment: Alignment) -> dict[str, 
 
 
 def accuracy_figures(
-    accuracy: Accuracy | None, seen: NDArray[np.bool_], grid: Grid
+    accuracy: Accuracy | None, seen: NDArray[np.bool_], grid: Grid, *, placed: bool = True
 ) -> dict[str, Any] | None:
     """Predicted deviations of the map's ground points in m, in the median and at the worst place;
-    what the positions' common error adds is given apart.
+    what the positions' common error adds is given apart, of maps that have a place (`placed`).
 
     Points count where the map is drawn (`seen`, on `grid`): those near a horizon in the picture
     may be off by kilometres, and are in no map.
@@ -149,12 +149,13 @@ def accuracy_figures(
     inside = (column >= 0) & (column < grid.width) & (row >= 0) & (row < grid.height)
     inside[inside] = seen[row[inside].astype(int), column[inside].astype(int)]
     sigma = accuracy.sigma_m[inside] if inside.any() else accuracy.sigma_m
+    shared = accuracy.shared_m if placed else (None, None)
     flat, up = np.sqrt((sigma[:, :2] ** 2).mean(1)), sigma[:, 2]
     return {
         "horizontal_m": {"median": _round(np.median(flat), 4), "worst": _round(flat.max(), 4)},
         "vertical_m": {"median": _round(np.median(up), 4), "worst": _round(up.max(), 4)},
-        "shared_horizontal_m": _round(accuracy.shared_m[0], 4),
-        "shared_vertical_m": _round(accuracy.shared_m[1], 4),
+        "shared_horizontal_m": _round(shared[0], 4),
+        "shared_vertical_m": _round(shared[1], 4),
         "focal_sigma_after_over_before": _round(accuracy.focal_share, 4),
         "design_effect": _round(accuracy.design_effect, 2),
     }
@@ -215,7 +216,9 @@ def figures(
         "warnings": list(warnings),
         "cameras": camera_figures(photos, alignment),
         "shutter": shutter_figures(photos, alignment),
-        "accuracy": accuracy_figures(alignment.accuracy, seen, drawn.views_grid),
+        "accuracy": accuracy_figures(
+            alignment.accuracy, seen, drawn.views_grid, placed=alignment.frame.crs is not None
+        ),
         "notes": list(notes),
     }
 
