@@ -25,6 +25,7 @@ from skyquilt.multispectral.captures import (
     captured_together,
     tags_of,
 )
+from skyquilt.multispectral.depth import depth_of, with_bits
 from skyquilt.multispectral.draw import PlacedBand
 from skyquilt.multispectral.focus import relative_detail, typical, unsharp_notes
 from skyquilt.multispectral.panels import by_panels
@@ -74,6 +75,10 @@ def place_bands(scene: Scene, others: Sequence[Photo], workers: Workers) -> Step
     own = bands_of_files([p for i, p in enumerate(aligned.photos) if i in poses and p.shows_a_band])
     found = bands_of_files(others)
     recorded = yield from _recorded([*own, *found], workers)
+    bits, told_of_bits = depth_of([*own, *found], recorded)
+    if bits:
+        own, found = (tuple(with_bits(b, bits) for b in of) for of in (own, found))
+        recorded = yield from _recorded([*own, *found], workers)
     # one that is gone tells nothing of its counts: all values would be as weak
     gone = {p.name: r.reason for b in own for p in b.photos if (r := recorded[p.name]).gone}
     placed = [PlacedBand(files=b, of_photo=_own_files(aligned, b)).without(gone) for b in own]
@@ -113,9 +118,11 @@ def place_bands(scene: Scene, others: Sequence[Photo], workers: Workers) -> Step
     ]
     placed.sort(key=lambda b: b.files.order)
     away = [p for i, p in enumerate(aligned.photos) if i not in poses and p.shows_a_band]
-    placed, panel = by_panels(placed, [*own, *bands_of_files(away), *found])
+    others_away = [with_bits(b, bits) for b in bands_of_files(away)]
+    placed, panel = by_panels(placed, [*own, *others_away, *found])
     bands, kind, weaker = _comparable(placed)
     notes = [f"The band {name} is left out: {reason}." for name, reason in refused.items()]
+    notes += [told_of_bits] if told_of_bits else []
     notes += [note for b in placed for note in _notes(b)]
     notes += unsharp_notes(placed, detail) + weaker
     return Placing(

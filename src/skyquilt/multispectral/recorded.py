@@ -39,6 +39,10 @@ class Recorded:
     detail: float = math.nan
     """Logarithm of its fine over its coarse detail (`imaging.grey.detail`), along the axis on which
     it is less; NaN where it is too small."""
+    brightest: float = 0.0
+    """Its largest count."""
+    step: int = 1
+    """What all its counts are multiples of."""
     gone: bool = False
     """Whether it changed or disappeared since it was found, so that another run may see it."""
 
@@ -55,14 +59,19 @@ def look_at(item: tuple[Photo, Reflectance]) -> Recorded:
     known = counts[np.isfinite(counts)]
     if not known.size or known.min() == known.max():
         return Recorded(reason="all its pixels have one value")
+    brightest = float(np.nanmax(pixels))
+    step = int(np.gcd.reduce(known.astype(np.int64)))
     saturated = float((known >= convert.saturated).mean())
     if saturated > _WHITE:
-        return Recorded(reason=f"{saturated:.0%} of its pixels are saturated")
+        why = f"{saturated:.0%} of its pixels are saturated"
+        return Recorded(reason=why, brightest=brightest, step=step)
     if convert.kind != "counts":
         median, bright = np.percentile(known, (50, 99)) - convert.black_level
         if median < _DARK * convert.full and bright < _BRIGHT * convert.full:
             return Recorded(reason="it is black: nothing in it is brighter than its black level")
-    return Recorded(saturated=saturated, detail=_detail(pixels, known))
+    return Recorded(
+        saturated=saturated, detail=_detail(pixels, known), brightest=brightest, step=step
+    )
 
 
 def _detail(pixels: NDArray[Any], known: NDArray[np.float32]) -> float:

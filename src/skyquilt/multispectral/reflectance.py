@@ -101,7 +101,7 @@ class Reflectance:
             best=_best_kind(tags),
             black_level=black,
             scale=scale,
-            saturated=2.0**bits - max(2.0 ** (bits - _SATURATED), 1.0),
+            saturated=_saturated(bits),
             full=2.0**bits,
             vignetting=vignetting,
             gradient=gradient,
@@ -123,6 +123,13 @@ class Reflectance:
         if value is None or not 0 < value < most:
             return replace(self, kind="radiance", irradiance=None)
         return replace(self, kind=self.best, irradiance=float(value))
+
+    def with_bits(self, bits: int) -> "Reflectance":
+        """The same of counts that have so many bits, fewer than those of the file."""
+        if self.kind == "counts":
+            return self
+        scale = self.scale * self.full / 2.0**bits
+        return replace(self, scale=scale, saturated=_saturated(bits), full=2.0**bits)
 
     def as_kind(self, kind: Kind) -> "Reflectance":
         """The same as values of a weaker kind, to compare bands of which not all have the better
@@ -162,6 +169,11 @@ class Reflectance:
             values /= (1 + self.gradient * rows).astype(np.float32)[:, None]
         values[full] = np.nan
         return values
+
+
+def _saturated(bits: int) -> float:
+    """The count of so many bits from which one is saturated."""
+    return 2.0**bits - max(2.0 ** (bits - _SATURATED), 1.0)
 
 
 def common_kind(bands: Sequence[Reflectance]) -> Kind:
