@@ -120,6 +120,32 @@ def test_tiles_that_were_left_alone_look_as_if_drawn_now(small):
     assert (off > 40).mean() < 0.02
 
 
+def test_a_photo_that_stands_by_its_metadata_yields_to_linked_ones(small):
+    """What others show, too, is drawn from them."""
+    members = small.members.by_id
+    member = members[sorted(members)[len(members) // 2]]
+    addresses = small.canvas.place(member, small.members.camera(member))
+
+    def shown():
+        """The photo that each pixel shows, of all tiles; -1 = none."""
+        compose = (small.canvas._composer(a, Feather(width_px=2.0)) for a in addresses)
+        return np.stack([c.drawn(c.plan(WHOLE)).photo for c in compose])
+
+    before = shown()
+    member.state = "placed"
+    small.canvas.place(member, small.members.camera(member))
+    loose = shown()
+    small.canvas.remove(member.id)
+    without = shown()
+    member.state = "refined"
+    small.canvas.place(member, small.members.camera(member))
+    others = without >= 0
+    assert np.array_equal(shown(), before)
+    own, kept = (((photo == member.id) & others).sum() for photo in (before, loose))
+    assert own > 3000 and kept < 0.3 * own  # the rims of those that others show remain
+    assert np.array_equal(loose >= 0, before >= 0)
+
+
 def test_folders_of_earlier_versions(small, tmp_path):
     folder = tmp_path / "old"
     live = LiveMap(folder)

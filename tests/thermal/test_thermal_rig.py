@@ -19,6 +19,7 @@ from skyquilt.model.event import Note, Result
 from skyquilt.ortho.exposure import NEUTRAL
 from skyquilt.settings import MosaicSettings
 from skyquilt.thermal import workflow
+from skyquilt.thermal.closed_shutter import CLOSED
 from skyquilt.thermal.workflow import iter_thermal
 
 HEAT = replace(Camera.ideal(width=320, height=256, focal=400.0), k1=-0.2)
@@ -106,10 +107,12 @@ def test_frames_of_other_ground_are_refused(flight, frames, output, tmp_path):
 def test_frames_that_are_not_drawn_are_named(flight, frames, output, tmp_path):
     """One is damaged behind a whole header, so this is met only when its values are read; one has
     another size, as a reduced copy, for which all were placed by their own map; another has no
-    visual photo beside it.
+    visual photo beside it; one shows the camera's closed shutter.
     """
     shutil.copytree(frames, tmp_path / "heat")
-    bad, small = sorted((tmp_path / "heat").glob("*.tif"))[2:4]
+    bad, small, shut = sorted((tmp_path / "heat").glob("*.tif"))[2:5]
+    noise = np.random.default_rng(0).normal(25, 0.05, (256, 320)).astype(np.float32)
+    tifffile.imwrite(shut, noise)
     tifffile.imwrite(small, tifffile.imread(small)[::2, ::2])
     tifffile.imwrite(tmp_path / "heat" / "heat_9999.tif", tifffile.imread(bad)[::-1])
     tifffile.imwrite(bad, tifffile.imread(bad), compression="zlib")
@@ -118,8 +121,9 @@ def test_frames_that_are_not_drawn_are_named(flight, frames, output, tmp_path):
     *before, last = iter_thermal(flight / "photos", tmp_path / "heat", output, SETTINGS)
     assert isinstance(last, Result)
     told = last.metrics["thermal"]
-    assert told["route"] == "rig" and told["photos_used"] == 7 and told["photos_total"] == 10
-    assert list(told["photos_rejected"]) == [bad.name, small.name, "heat_9999.tif"]
+    assert told["route"] == "rig" and told["photos_used"] == 6 and told["photos_total"] == 10
+    assert list(told["photos_rejected"]) == [bad.name, small.name, "heat_9999.tif", shut.name]
+    assert told["photos_rejected"][shut.name] == CLOSED
     assert "of another camera or format" in told["photos_rejected"][small.name]
     alone = "no visual photo was taken together with it"
     assert told["photos_rejected"]["heat_9999.tif"] == alone

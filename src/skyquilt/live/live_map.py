@@ -37,6 +37,7 @@ from skyquilt.live.initial_pose import CLIMBED, InitialPose
 from skyquilt.live.ledger import DAMAGED, Ledger
 from skyquilt.live.links import LiveLinks
 from skyquilt.live.local_pose import LocalPose
+from skyquilt.live.loose import LivePlaced
 from skyquilt.live.members import Members, Queues
 from skyquilt.live.neighbours import Neighbours
 from skyquilt.live.photo_intake import OTHER_BAND, Intake, Refused
@@ -154,7 +155,7 @@ class LiveMap:
             self.store,
             self.settings.max_view_angle,
             self.live_links.marks.shown,
-            (blur.of, veils.of),
+            (blur.of, veils.of, LivePlaced(self.members).of),
         )
         self.canvas.gsd = float(self.ledger.meta("gsd", 0.0))
         self.canvas.ground = float(self.ledger.meta("ground", 0.0))

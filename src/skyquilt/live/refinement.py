@@ -14,6 +14,7 @@ from skyquilt.live.events import MapEvents, Update
 from skyquilt.live.ledger import hit
 from skyquilt.live.links import link_bytes
 from skyquilt.live.local_pose import Change, LocalPose
+from skyquilt.live.loose import is_loose
 from skyquilt.live.members import Member, Queues, about_record
 from skyquilt.live.redraw_queue import RedrawQueue
 from skyquilt.live.settings import WHOLE
@@ -115,6 +116,7 @@ class Refinement:
             self.schedule.write(self.ledger)
             self.map_events.photo(member, reason=why)
             altered = {m.id: m for m in (*self.blur.look(member), *self.veils.look(member))}
+            altered |= {member.id: member} if is_loose(member) else {}
             self.thermal_notes.look(member)
         hit("photo refined")
         for other in altered.values():
@@ -174,6 +176,7 @@ class Refinement:
         self._pairs = self._apart()
         for i, pose in moved.items():
             member = self.members.by_id[i]
+            loose = is_loose(member)
             member.pose, member.camera = pose, camera_of.get(i, member.camera)
             if member.state != "superseded":
                 member.state = "refined"
@@ -181,6 +184,8 @@ class Refinement:
             self.local_pose.neighbours.indexed(member)
             if member.state == "refined":
                 self.redraw.moved(member)
+                if loose:
+                    self.redraw.altered(member)
 
     def put_back(self, rejected: Mapping[int, str]) -> None:
         """Photos that an adjustment of their whole block could not hold, and that lie or look
@@ -204,7 +209,7 @@ class Refinement:
             self.members.save(member, about=about_record(member, why), reason=why)
             self.map_events.photo(member, reason=why)
             self.local_pose.neighbours.indexed(member)
-            self.redraw.moved(member)
+            self.redraw.altered(member)
 
     def heights(
         self,

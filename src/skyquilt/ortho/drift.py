@@ -110,23 +110,36 @@ class Drift:
         bounds: tuple[float, float, float, float],
     ) -> Samples:
         """Values of views at points of the ground."""
-        west, south, east, north = bounds
-        step = np.sqrt((east - west) * (north - south) / max(self.points, 40 * len(views)))
-        x, y = np.meshgrid(np.arange(west, east, step), np.arange(south, north, step))
-        z = surface.at(x, y)
-        parts = []
-        for row, view in enumerate(views):
-            nodes = project_nodes(view, x, y, z)
-            seen = np.flatnonzero(nodes.seen.ravel())
-            u, v = nodes.u.ravel()[seen], nodes.v.ravel()[seen]
-            value = _nearest(thumbnails[view.photo], u, v, view)
-            good = np.isfinite(value)
-            place = (np.c_[u, v] + 0.5) / [view.camera.width, view.camera.height]
-            parts.append((seen[good], np.full(int(good.sum()), row), value[good], place[good]))
-        point, rows, values, places = (np.concatenate(p) for p in zip(*parts, strict=True))
-        return Samples(
-            point=point.astype(np.int64), row=rows.astype(np.int64), value=values, place=places
-        )
+        return ground_samples(views, thumbnails, surface, bounds, max(self.points, 40 * len(views)))
+
+
+def ground_samples(
+    views: Sequence[View],
+    thumbnails: Mapping[int, NDArray[Any]],
+    surface: Surface,
+    bounds: tuple[float, float, float, float],
+    points: int,
+) -> Samples:
+    """Values of views, from thumbnails (h, w) of their photos, at about so many points of the
+    ground inside bounds (west, south, east, north) in m.
+    """
+    west, south, east, north = bounds
+    step = np.sqrt((east - west) * (north - south) / points)
+    x, y = np.meshgrid(np.arange(west, east, step), np.arange(south, north, step))
+    z = surface.at(x, y)
+    parts = []
+    for row, view in enumerate(views):
+        nodes = project_nodes(view, x, y, z)
+        seen = np.flatnonzero(nodes.seen.ravel())
+        u, v = nodes.u.ravel()[seen], nodes.v.ravel()[seen]
+        value = _nearest(thumbnails[view.photo], u, v, view)
+        good = np.isfinite(value)
+        place = (np.c_[u, v] + 0.5) / [view.camera.width, view.camera.height]
+        parts.append((seen[good], np.full(int(good.sum()), row), value[good], place[good]))
+    point, rows, values, places = (np.concatenate(p) for p in zip(*parts, strict=True))
+    return Samples(
+        point=point.astype(np.int64), row=rows.astype(np.int64), value=values, place=places
+    )
 
 
 def _nearest(thumbnail: NDArray[Any], u: NDArray[Any], v: NDArray[Any], view: View) -> Doubles:

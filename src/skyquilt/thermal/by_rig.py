@@ -2,8 +2,9 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from skyquilt.coregistration.rig import FindRig, Rig, RigPair
 from skyquilt.coregistration.workflow import outcome_of
 from skyquilt.errors import PhotoFailedError
 from skyquilt.geometry.transforms import transfer
+from skyquilt.imaging.blank import Blank
 from skyquilt.imaging.grey import shrink
 from skyquilt.imaging.nodes import View
 from skyquilt.imaging.views import make_views, on_ground
@@ -29,6 +31,7 @@ from skyquilt.model.registration import RefusedRegistration, Registration
 from skyquilt.ortho.blend import Blend
 from skyquilt.ortho.companions import geotransform
 from skyquilt.ortho.compose import Composer
+from skyquilt.ortho.drift import Drift, ground_samples
 from skyquilt.ortho.exposure import NEUTRAL, Exposure
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.radiometry import DriftMethod, balances_drift, drift_of, value_tags
@@ -36,14 +39,14 @@ from skyquilt.photos.left_out import told_left_out, without_partner
 from skyquilt.photos.together import late_by, taken_together
 from skyquilt.raster import CogWriter, RasterSpec
 from skyquilt.settings import PictureSettings
+from skyquilt.thermal.closed_shutter import CLOSED, closed_frames
+from skyquilt.thermal.rig_marks import drawn, marks_in
 from skyquilt.workflows.flow import Scene
 from skyquilt.workflows.photo_features import THUMBNAIL, pixels_again
 from skyquilt.workflows.second_camera import far, pose_beside, seen_together
 
 MOST_PAIRS = 12
-"""Largest number of pairs registered, distributed over the flight; each takes one or two
-seconds.
-"""
+"""Most pairs that are registered, spread over the flight; each takes one or two seconds."""
 KNOWN_FOCAL = 0.01
 """The thermal focal length is not estimated if its relative standard deviation is below this."""
 _AGREE = 0.75
@@ -75,6 +78,10 @@ class Rigged:
     """Poses of those that can be drawn in the visual map's frame."""
     rejected: tuple[RejectedPhoto, ...] = ()
     """Those that cannot be decoded, or were not taken together with a placed visual one."""
+    marks: Mapping[int, Blank] = field(default_factory=dict)
+    """Where frames show marks, by their index."""
+    notes: tuple[str, ...] = ()
+    """What is told of these."""
 
     def without(self, error: PhotoFailedError) -> "Rigged":
         """The others, without the photo on which drawing failed."""
@@ -150,7 +157,25 @@ def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistrati
     )
     photos = tuple(thermal[j] for _, j in pairs)
     left = (*bad.values(), *other, *alone)
-    return Rigged(rig=rig, photos=photos, alignment=alignment, rejected=left)
+    return _open(Rigged(rig=rig, photos=photos, alignment=alignment, rejected=left), scene.ground)
+
+
+def _open(found: Rigged, ground: Ground) -> Rigged:
+    """The frames taken while the thermal camera's shutter was open, and where they show marks."""
+    views = _views(found, ground)
+    try:
+        frames = _thumbnails(found, views)
+    except PhotoFailedError:  # told when it is drawn
+        return found
+    marks, said = marks_in(found.photos, views, frames, ground)
+    found = replace(found, marks=marks, notes=said)
+    many = max(Drift.points, 40 * len(views))
+    shut = closed_frames(ground_samples(views, frames, ground.surface, ground.grid.bounds, many))
+    if len(views) - len(shut) < FindRig.minimum:
+        return found
+    for k in sorted(shut):
+        found = found.without(PhotoFailedError(found.photos[views[k].photo].name, CLOSED))
+    return found
 
 
 def _beside(
@@ -293,13 +318,20 @@ def drift_of_rigged(
     if not balances_drift(settings, unit):
         return NEUTRAL
     views = _views(found, ground)
-    frames = {v.photo: shrink(pixels_again(found.photos[v.photo]), THUMBNAIL)[0] for v in views}
+    frames = _thumbnails(found, views)
     return drift_of(views, frames, ground.surface, ground.grid.bounds, unit, drift, settings)
 
 
-def _views(found: Rigged, ground: Ground) -> list[View]:
-    """What the thermal frames see within the limits of the visual photos."""
-    return make_views(found.alignment, ground.surface, replace(ground.limits, blanks={}, marks={}))
+def _thumbnails(found: Rigged, views: Sequence[View]) -> dict[int, NDArray[Any]]:
+    return {v.photo: shrink(pixels_again(found.photos[v.photo]), THUMBNAIL)[0] for v in views}
+
+
+def _views(
+    found: Rigged, ground: Ground, marks: Mapping[int, Blank] = MappingProxyType({})
+) -> list[View]:
+    """What the thermal frames see within the limits of the visual photos, but for `marks`."""
+    limits = replace(ground.limits, blanks=marks, marks={})
+    return make_views(found.alignment, ground.surface, limits)
 
 
 def draw_rigged(
@@ -310,7 +342,7 @@ def draw_rigged(
     """
     first, grid = found.photos[0], scene.ground.grid
     kind, real = np.dtype(first.dtype), np.dtype(first.dtype).kind == "f"
-    compose = Composer(
+    plain = Composer(
         grid=grid,
         views=_views(found, scene.ground),
         surface=scene.ground.surface,
@@ -320,6 +352,8 @@ def draw_rigged(
         dtype=kind,
         exposure=exposure,
     )
+    marked = plain if found.marks else None
+    unmarked = replace(plain, views=_views(found, scene.ground, found.marks)) if marked else plain
     spec = RasterSpec(
         width=grid.width,
         height=grid.height,
@@ -338,18 +372,18 @@ def draw_rigged(
             window = Window(
                 row=block.row0, column=block.col0, height=block.height, width=block.width
             )
-            composed = compose(window)
-            writer.write_block(block, composed.pixels, composed.photo >= 0)
+            writer.write_block(block, *drawn(window, unmarked, marked))
 
 
 def rig_notes(found: Rigged) -> list[Note]:
     """What is told of how both cameras go together, and of photos that are not drawn."""
-    rig, drawn = found.rig, len(found.alignment.poses)
-    few = len(found.rejected) > drawn
+    rig, used = found.rig, len(found.alignment.poses)
+    few = len(found.rejected) > used
     notes = [Note(text=text, warning=few) for text in told_left_out(found.rejected)]
+    notes += [Note(text=text) for text in found.notes]
     if few:
         text = (
-            f"only {drawn} of {drawn + len(found.rejected)} thermal photos are drawn, by the poses"
+            f"only {used} of {used + len(found.rejected)} thermal photos are drawn, by the poses"
             " of the visual ones; --thermal-route maps uses the others, too"
         )
         notes.append(Note(text=text, warning=True))
