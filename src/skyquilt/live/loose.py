@@ -1,6 +1,7 @@
-"""Photos that stand by their metadata though they were compared with others: they may show no
-ground (a lens cap, a hand, a thermal camera's closed shutter) or lie elsewhere, so they are drawn
-only where no other photo shows the ground. The map at the end leaves most of them out.
+"""Photos that stand by their metadata though they were compared with others, or that an adjustment
+of all could not hold: they may show no ground (a lens cap, a hand, a thermal camera's closed
+shutter) or lie elsewhere, so they are drawn only where no other photo shows the ground. The map at
+the end leaves most of them out.
 """
 
 from skyquilt.imaging.blank import Blank, whole_picture

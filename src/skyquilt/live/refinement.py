@@ -188,10 +188,11 @@ class Refinement:
                     self.redraw.altered(member)
 
     def put_back(self, rejected: Mapping[int, str]) -> None:
-        """Photos that an adjustment of their whole block could not hold, and that lie or look
-        elsewhere than they report, stand where their metadata put them again (inside a
-        transaction): the pose that they had rests on matches or on a start that the others prove
-        wrong. `rejected`: why each was not held.
+        """Photos that an adjustment of their whole block could not hold hang on too little: they
+        count as loose, so others are drawn in their place (inside a transaction). Those that lie
+        or look elsewhere than they report stand where their metadata put them again: the pose that
+        they had rests on matches or on a start that the others prove wrong. `rejected`: why each
+        was not held.
         """
         for i, why in rejected.items():
             member = self.members.by_id[i]
@@ -200,12 +201,11 @@ class Refinement:
                 continue
             away = np.hypot(*(member.pose.map_C - first.map_C)[:2])
             if (
-                turned_deg(member.pose, member.prior) <= STATED_DEG
-                and away <= FAR_OFF * member.prior.sigma_C[0]
+                turned_deg(member.pose, member.prior) > STATED_DEG
+                or away > FAR_OFF * member.prior.sigma_C[0]
             ):
-                continue
-            member.pose, member.state = first, "placed"
-            member.learned = None
+                member.pose = first
+            member.state, member.learned = "placed", None
             self.members.save(member, about=about_record(member, why), reason=why)
             self.map_events.photo(member, reason=why)
             self.local_pose.neighbours.indexed(member)
