@@ -260,7 +260,6 @@ def test_contradicting_focal_lengths_are_named_with_both_values(make_jpeg):
     [
         (3, 250, 100.0, 3.0),  # centimetres, as stated: 4 mm at 25 px a mm
         (2, 250, 100.0, 3.0),  # said to be inches: 39 px
-        (3, 500, 200.0, 100.0),  # a unit that is none: either may be right
     ],
 )
 def test_a_focal_plane_in_another_unit_than_stated(make_jpeg, unit, per_unit, px, sigma):
@@ -275,3 +274,40 @@ def test_a_focal_plane_in_another_unit_than_stated(make_jpeg, unit, per_unit, px
     assert found.source == "focal-plane"
     assert found.px == pytest.approx(px, rel=0.01)
     assert found.sigma_px == pytest.approx(sigma, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("per_mm", "equivalent", "source", "px"),
+    [
+        (50, 29, "35mm", 100.4),  # 200 px by the focal plane
+        (174, 29, "35mm", 100.4),  # the 35 mm equivalent written as the focal length: 696 px
+        (25, 120, "focal-plane", 100.0),  # 415 px by the equivalent
+        (7, 29, "35mm", 100.4),  # 28 px by the focal plane
+    ],
+)
+def test_of_two_that_contradict_each_other_the_usual_one_is_taken(
+    make_jpeg, per_mm, equivalent, source, px
+):
+    """It is known no better than a guess: the other one may be right."""
+    exif = exif_of(
+        "Unknown",
+        FocalLength=(4, 1),
+        FocalPlaneXResolution=(10 * per_mm, 1),
+        FocalPlaneResolutionUnit=3,
+        FocalLengthIn35mmFilm=equivalent,
+    )
+    found = focal(make_jpeg, exif)
+    assert (found.source, found.px) == (source, pytest.approx(px, rel=0.01))
+    assert found.sigma_px == pytest.approx(found.px / 4)
+
+
+@pytest.mark.parametrize("equivalent", [4, 7, 8])
+def test_a_35mm_equivalent_that_only_a_circular_fisheye_has_is_none(make_jpeg, equivalent):
+    """A program wrote the focal length there: 7 mm are 24 px of 120, and 80 degrees 72 px."""
+    exif = exif_of("Unknown", FocalLength=(equivalent, 1), FocalLengthIn35mmFilm=equivalent)
+    found = focal(make_jpeg, exif)
+    assert (found.source, found.px) == ("guess", 90.0)
+    exif["Exif"][piexif.ExifIFD.FocalPlaneXResolution] = (900 // equivalent, 1)
+    exif["Exif"][piexif.ExifIFD.FocalPlaneResolutionUnit] = 3
+    found = focal(make_jpeg, exif)
+    assert (found.source, found.sigma_px / found.px) == ("focal-plane", pytest.approx(0.03))

@@ -42,7 +42,7 @@ class Recorded:
     brightest: float = 0.0
     """Its largest count."""
     step: int = 1
-    """What all its counts are multiples of."""
+    """What all its counts are multiples of; 1 of real numbers."""
     gone: bool = False
     """Whether it changed or disappeared since it was found, so that another run may see it."""
 
@@ -60,7 +60,7 @@ def look_at(item: tuple[Photo, Reflectance]) -> Recorded:
     if not known.size or known.min() == known.max():
         return Recorded(reason="all its pixels have one value")
     brightest = float(np.nanmax(pixels))
-    step = int(np.gcd.reduce(known.astype(np.int64)))
+    step = int(np.gcd.reduce(known.astype(np.int64))) if pixels.dtype.kind in "ui" else 1
     saturated = float((known >= convert.saturated).mean())
     if saturated > _WHITE:
         why = f"{saturated:.0%} of its pixels are saturated"

@@ -81,6 +81,10 @@ _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _PLAUSIBLE = (0.2, 60.0)
 """A focal length outside these multiples of the long side is an error, not a lens."""
 _MOST_ZOOM = 16.0
+_WIDEST_35MM = 9.0
+"""A smaller 35 mm equivalent, in mm, is none: some programs write the focal length there, which
+small sensors have. Only a circular fisheye is as wide.
+"""
 _APART = 1.2
 """Focal lengths that differ by more than this factor contradict each other; 35 mm values are
 rounded.
@@ -185,7 +189,8 @@ def _on_plane(exif: Exif, width: int, height: int) -> Focal | None:
 
 def _believed_plane(exif: Exif, width: int, height: int) -> Focal | None:
     """By focal-plane resolution, in the unit with which it agrees with the 35 mm equivalent, since
-    cameras confuse inches and centimetres. Where it agrees in none, either of the two may be wrong.
+    cameras confuse inches and centimetres. Where it agrees in none, either of the two may be wrong:
+    what is nearer to the usual focal length is taken, and known no better than that.
     """
     found, rounded = _on_plane(exif, width, height), _from_35mm(exif, width, height)
     if found is None or rounded is None or _agree(found.px, rounded.px):
@@ -195,8 +200,9 @@ def _believed_plane(exif: Exif, width: int, height: int) -> Focal | None:
         px = found.px * stated / mm
         if _agree(px, rounded.px):
             return Focal(px=px, sigma_px=0.03 * px, source="focal-plane")
-    apart = abs(found.px - rounded.px)
-    return Focal(px=found.px, sigma_px=max(found.sigma_px, apart), source="focal-plane")
+    usual = guessed_focal(width, height, thermal=False)
+    nearer = min((found, rounded), key=lambda f: abs(math.log(f.px / usual.px)))
+    return replace(nearer, sigma_px=nearer.px * usual.sigma_px / usual.px)
 
 
 def _agree(px: float, other: float) -> bool:
@@ -205,7 +211,7 @@ def _agree(px: float, other: float) -> bool:
 
 def _from_35mm(exif: Exif, width: int, height: int) -> Focal | None:
     mm = exif.number(tag.FOCAL_35MM)
-    if not mm or mm < 0:
+    if not mm or mm < _WIDEST_35MM:
         return None
     px = mm / _DIAGONAL_35MM * math.hypot(width, height)
     return Focal(px=px, sigma_px=0.05 * px, source="35mm")
