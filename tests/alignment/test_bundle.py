@@ -631,6 +631,19 @@ def test_a_guessed_focal_length_far_from_the_true_one_is_guessed_again():
     assert not any("shutter" in n for n in found.notes)
 
 
+@pytest.mark.parametrize(
+    "times", [0.5, *(pytest.param(k, marks=SLOW) for k in (0.4, 0.65, 1.5, 2.5))]
+)
+def test_a_focal_length_that_files_tell_falsely_is_not_believed(times, plain):
+    """Known to 5 % as they say; believed, one of half the length ended 52 % off."""
+    flown = Flown()
+    told = Focal(px=times * LENS[0], sigma_px=0.05 * times * LENS[0], source="35mm")
+    flown.photos = [replace(p, focal=told) for p in flown.photos]
+    found = flown.aligned()
+    assert found.cameras["cam"].focal == pytest.approx(LENS[0], rel=0.03)
+    assert relative_error(flown, found) < 1.1 * relative_error(*plain)
+
+
 @pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=SLOW) for k in (1, 2))])
 def test_photos_cropped_towards_a_corner_keep_their_lens(seed):
     """The axis meets them 150 px right and 110 px below the middle; two lines that were flown in

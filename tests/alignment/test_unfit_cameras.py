@@ -18,6 +18,7 @@ from skyquilt.alignment.unfit_cameras import (
     CY,
     cut_cameras,
     cut_notes,
+    false_focals,
     loosened,
     other_focals,
     uncentred,
@@ -216,3 +217,24 @@ def test_guessed_focal_lengths_begin_again_where_they_tend(found, begun, again):
     multiples, sure = other_focals(alignment(focal=found), {"cam": guess}, begun)
     assert multiples == ({} if again is None else {"cam": pytest.approx(again)})
     assert sure == (again is None)
+
+
+@pytest.mark.parametrize(
+    ("found", "begun", "again", "certain"),
+    [
+        (760.0, {}, None, True),  # 1.7 deviations
+        (800.0, {}, (8 / 7) ** 2, False),  # 2.9: what is told holds it back
+        (600.0, {}, (6 / 7) ** 2, False),
+        (1050.0, {}, 1.5**2, True),  # 10
+        (2100.0, {}, 6.0, True),
+        (1000.0, {"cam": 1.4}, None, True),
+        (1400.0, {"cam": 1.4}, 2.0, True),  # begun too far from it
+    ],
+)
+def test_focal_lengths_that_files_tell_begin_again_where_pictures_contradict(
+    found, begun, again, certain
+):
+    told = Focal(px=FOCAL, sigma_px=35.0, source="35mm")
+    multiples, sure = false_focals(alignment(focal=found), {"cam": told, "other": told}, begun)
+    assert multiples == ({} if again is None else {"cam": pytest.approx(again)})
+    assert sure is certain

@@ -301,7 +301,7 @@ def test_of_two_that_contradict_each_other_the_usual_one_is_taken(
     assert found.sigma_px == pytest.approx(found.px / 4)
 
 
-@pytest.mark.parametrize("equivalent", [4, 7, 8])
+@pytest.mark.parametrize("equivalent", [4, 7, 10])
 def test_a_35mm_equivalent_that_only_a_circular_fisheye_has_is_none(make_jpeg, equivalent):
     """A program wrote the focal length there: 7 mm are 24 px of 120, and 80 degrees 72 px."""
     exif = exif_of("Unknown", FocalLength=(equivalent, 1), FocalLengthIn35mmFilm=equivalent)

@@ -33,6 +33,7 @@ from skyquilt.alignment.tries import Beginning, Survey, Tried
 from skyquilt.alignment.unfit_cameras import (
     CameraPriors,
     cut_cameras,
+    false_focals,
     loosened,
     other_focals,
     uncentred,
@@ -80,7 +81,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 80
+    version: ClassVar[int] = 81
 
     def __call__(
         self,
@@ -125,6 +126,7 @@ class Bundle:
             return priors_by_camera(taken(tried.begun), self.distortion)
 
         guesses = {p.camera_key: p.focal for p in photos if p.lens_guessed}
+        told = {p.camera_key: p.focal for p in photos if p.focal_alone}
         survey = Survey(
             names=[p.name for p in photos],
             cameras=[p.camera_key for p in photos],
@@ -134,6 +136,7 @@ class Bundle:
             unfit=lambda t: unfit_cameras(t.found, priors_of(t)),
             cut=lambda t: cut_cameras(t.found, priors_of(t)),
             focals=lambda t: other_focals(t.found, guesses, t.begun.focals),
+            false_focals=lambda t: false_focals(t.found, told, t.begun.focals),
             beginnings=lambda t: beginnings(t.found, photos, t.begun.priors),
             guess=guess,
         )

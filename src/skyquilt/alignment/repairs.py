@@ -113,6 +113,22 @@ def _guessed_focals(last: Tried, survey: Survey) -> Tried:
     return replace(best, notes=(*last.notes, *notes))
 
 
+def _false_focals(last: Tried, survey: Survey) -> Tried:
+    """Focal lengths that files tell and pictures contradict are guesses, too."""
+    best = last
+    for again in range(FOCALS_AGAIN):
+        multiples, sure = survey.false_focals(best)
+        if not multiples:
+            break
+        focals = {**best.begun.focals, **multiples}
+        other = survey.tried(best.begun, focals=focals, name=f"told {again} ")
+        fits = fits_as_well if sure else fits_cut
+        if not fits(other.found, best.found):
+            break
+        best = replace(other, notes=last.notes)
+    return best
+
+
 def _false_views(last: Tried, survey: Survey) -> Tried:
     """Photos of an oblique survey that look down, whatever they report, begin so: some programs
     count a gimbal's pitch from straight down, or write one angle into all files.
@@ -350,6 +366,7 @@ def _if_nearer(
 
 REPAIRS: tuple[Callable[[Tried, Survey], Tried], ...] = (
     _guessed_focals,
+    _false_focals,
     _false_views,
     _mirrored_positions,
     _as_reported,

@@ -53,8 +53,10 @@ FEWEST_FOCAL, FOCAL_SPREAD, FOCAL_SCALE = 5, 0.15, 0.2
 """nor do fewer photos, nor some that differ by more than this share (median), nor positions that
 leave the scale less certain than this share.
 """
-FOCAL_SHARE = 0.2
-"""Deviation of a focal length that heights tell, as a share of it: ground is uneven."""
+FOCAL_SHARE, DOUBTED_SHARE = 0.2, 0.25
+"""Deviation of a focal length that heights tell, as a share of it: ground is uneven; least one of
+another than files tell.
+"""
 GROSS_DEG = 20.0
 """A heading that is off by more is false."""
 UNKNOWN_YAW_DEG = 90.0
@@ -217,13 +219,14 @@ def with_focals(
     photos: Sequence[Photo], factors: Mapping[str, float], share: float | None = None
 ) -> list[Photo]:
     """The photos, focal lengths of some cameras (names) times a factor, with a deviation of this
-    share of them; None: of the share that they had.
+    share of them; None: of the share that they had, or of a guess where they are not believed.
     """
     out = list(photos)
     for i, photo in enumerate(photos):
         if (factor := factors.get(photo.camera_key)) is not None:
             px = photo.focal.px * factor
-            sigma = photo.focal.sigma_px * factor if share is None else share * px
+            own = photo.focal.sigma_px / photo.focal.px
+            sigma = (max(own, DOUBTED_SHARE) if share is None else share) * px
             out[i] = replace(photo, focal=replace(photo.focal, px=px, sigma_px=sigma))
     return out
 

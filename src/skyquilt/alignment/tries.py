@@ -22,7 +22,7 @@ class Beginning:
     enlarged: Mapping[int, float] = field(default_factory=dict)
     """Factors of photos that are enlarged against others of their camera."""
     focals: Mapping[str, float] = field(default_factory=dict)
-    """Factors of guessed focal lengths, by camera."""
+    """Factors of focal lengths that are guessed or not believed, by camera."""
     loose: frozenset[str] = frozenset()
     """Cameras whose shutters and aspect ratios pictures alone tell."""
     cut: frozenset[str] = frozenset()
@@ -70,6 +70,8 @@ class Survey:
     """Names of those whose photos may have been cut off (`cut_cameras`)."""
     focals: Callable[[Tried], tuple[Mapping[str, float], bool]]
     """Factors of guessed focal lengths that may be others (`other_focals`)."""
+    false_focals: Callable[[Tried], tuple[Mapping[str, float], bool]]
+    """The same of focal lengths that files may tell falsely (`unfit_cameras.false_focals`)."""
     beginnings: Callable[[Tried], Beginnings]
     """Where photos begin in space (`oblique_start.beginnings`)."""
     guess: Callable[[Tried], Sequence[Prior] | None]

@@ -55,6 +55,10 @@ guess allows; where they leave it open, or it was begun again, less is of no eff
 """
 MOST_FAR = 12.0
 """Factor by which it can be another one."""
+MAYBE_FALSE, FALSE = 2.0, 5.0
+"""A focal length in the file so many deviations off what an adjustment with it finds may be false,
+and is: it holds that back, most of all where it is too short.
+"""
 
 
 def unfit_cameras(found: Alignment, priors: CameraPriors) -> frozenset[str]:
@@ -201,6 +205,28 @@ def other_focals(
                 towards = further
         if 1 / MOST_FAR < towards * before < MOST_FAR:
             out[key] = towards * before
+    return out, sure
+
+
+def false_focals(
+    found: Alignment, told: Mapping[str, Focal], begun: Mapping[str, float]
+) -> tuple[dict[str, float], bool]:
+    """Multiples of focal lengths that files tell (`told`: of each camera that has one) to begin
+    with instead, where an alignment contradicts these, or went far from the multiples that it
+    began with (`begun`); and whether all these are false beyond doubt.
+    """
+    out, sure = dict[str, float](), True
+    for key in sorted(told.keys() & found.cameras.keys()):
+        focal, multiple = told[key], found.cameras[key].focal / told[key].px
+        if key in begun:
+            towards = multiple / begun[key]
+            if max(towards, 1 / towards) > FAR_OPEN:
+                out[key] = multiple
+            continue
+        apart = abs(multiple - 1) * focal.px / focal.sigma_px
+        if apart > MAYBE_FALSE:
+            sure &= apart > FALSE
+            out[key] = multiple * min(max(multiple, 0.5), 2.0)  # what is told holds it back
     return out, sure
 
 

@@ -247,6 +247,12 @@ class Photo:
         return not told and self.focal.source == "guess"
 
     @property
+    def focal_alone(self) -> bool:
+        """Whether its focal length is all that is told of the lens."""
+        told = self.calibration is not None or self.shown_lens is not None
+        return not told and self.focal.source != "guess"
+
+    @property
     def shows_a_band(self) -> bool:
         """Whether the file shows one band of a multispectral camera."""
         return bool(self.band_name) and self.channels == 1

@@ -81,7 +81,7 @@ _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _PLAUSIBLE = (0.2, 60.0)
 """A focal length outside these multiples of the long side is an error, not a lens."""
 _MOST_ZOOM = 16.0
-_WIDEST_35MM = 9.0
+_WIDEST_35MM = 11.0
 """A smaller 35 mm equivalent, in mm, is none: some programs write the focal length there, which
 small sensors have. Only a circular fisheye is as wide.
 """
