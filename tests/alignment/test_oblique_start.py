@@ -254,6 +254,7 @@ def test_photos_that_stay_turned_are_hung_on_the_others():
         linked=len(flown.photos),
         adjust=adjust,
         unfit=None,
+        false_focals=None,
         cut=None,
         focals=None,
         beginnings=lambda tried: oblique_start.NO_BEGINNINGS,

@@ -113,22 +113,6 @@ def _guessed_focals(last: Tried, survey: Survey) -> Tried:
     return replace(best, notes=(*last.notes, *notes))
 
 
-def _false_focals(last: Tried, survey: Survey) -> Tried:
-    """Focal lengths that files tell and pictures contradict are guesses, too."""
-    best = last
-    for again in range(FOCALS_AGAIN):
-        multiples, sure = survey.false_focals(best)
-        if not multiples:
-            break
-        focals = {**best.begun.focals, **multiples}
-        other = survey.tried(best.begun, focals=focals, name=f"told {again} ")
-        fits = fits_as_well if sure else fits_cut
-        if not fits(other.found, best.found):
-            break
-        best = replace(other, notes=last.notes)
-    return best
-
-
 def _false_views(last: Tried, survey: Survey) -> Tried:
     """Photos of an oblique survey that look down, whatever they report, begin so: some programs
     count a gimbal's pitch from straight down, or write one angle into all files.
@@ -318,6 +302,22 @@ def _found_directions(last: Tried, survey: Survey) -> Tried:
     return best if best is last else replace(best, notes=last.notes)
 
 
+def _false_focals(last: Tried, survey: Survey) -> Tried:
+    """Focal lengths that files tell and pictures contradict are guesses, too."""
+    best = last
+    for again in range(FOCALS_AGAIN):
+        multiples, sure = survey.false_focals(best)
+        if not multiples:
+            break
+        focals = {**best.begun.focals, **multiples}
+        other = survey.tried(best.begun, focals=focals, name=f"told {again} ")
+        fits = fits_as_well if sure else fits_cut
+        if not fits(other.found, best.found):
+            break
+        best = replace(other, notes=last.notes)
+    return best
+
+
 def _unfit_cameras(last: Tried, survey: Survey) -> Tried:
     """Shutters and aspect ratios that pictures contradict are told by these alone."""
     cameras = survey.unfit(last)
@@ -366,7 +366,6 @@ def _if_nearer(
 
 REPAIRS: tuple[Callable[[Tried, Survey], Tried], ...] = (
     _guessed_focals,
-    _false_focals,
     _false_views,
     _mirrored_positions,
     _as_reported,
@@ -380,6 +379,7 @@ REPAIRS: tuple[Callable[[Tried, Survey], Tried], ...] = (
     _false_tilts,
     _guessed_directions,
     _found_directions,
+    _false_focals,
     _held_in_the_middle,
     _unfit_cameras,
     _displaced_parts,
