@@ -644,6 +644,22 @@ def test_a_focal_length_that_files_tell_falsely_is_not_believed(times, plain):
     assert relative_error(flown, found) < 1.1 * relative_error(*plain)
 
 
+def test_a_camera_told_falsely_beside_one_that_is_not_told():
+    """Both are found."""
+    flown = Flown()
+    of = {
+        "short": Focal(px=0.5 * LENS[0], sigma_px=0.025 * LENS[0], source="35mm"),
+        "untold": Focal(px=0.4 * LENS[0], sigma_px=0.1 * LENS[0], source="guess"),
+    }
+    flown.photos = [
+        replace(p, camera_key=key, focal=of[key])
+        for p, key in zip(flown.photos, [*of] * 9, strict=True)
+    ]
+    found = flown.aligned()
+    for camera in found.cameras.values():
+        assert camera.focal == pytest.approx(LENS[0], rel=0.03)
+
+
 @pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=SLOW) for k in (1, 2))])
 def test_photos_cropped_towards_a_corner_keep_their_lens(seed):
     """The axis meets them 150 px right and 110 px below the middle; two lines that were flown in

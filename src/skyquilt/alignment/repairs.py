@@ -4,7 +4,7 @@ Each repair judges what files tell by an adjustment, adjusts again with what it 
 takes that only where it fits better. They follow one another in the order of `REPAIRS`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -64,8 +64,7 @@ BEGUN_AGAIN = 5
 long as photos come nearer to their positions.
 """
 FOCALS_AGAIN = 6
-"""Guessed focal lengths are guessed again so often at most: each time an adjustment comes nearer.
-"""
+"""Focal lengths are guessed again so often at most: each time an adjustment comes nearer."""
 
 
 def begun_with(priors: Sequence[Prior], survey: Survey, *, repair: bool) -> Tried:
@@ -99,18 +98,33 @@ def repaired(first: Tried, survey: Survey) -> Tried:
 
 def _guessed_focals(last: Tried, survey: Survey) -> Tried:
     """Focal lengths that no file tells are guessed again where they tend."""
-    best, notes = last, list[str]()
+    best = _other_focals(last, survey, survey.focals, "focal")
+    if best is last:
+        return last
+    return replace(best, notes=(*last.notes, *focal_notes(best.found, best.begun.focals)))
+
+
+def _other_focals(
+    last: Tried,
+    survey: Survey,
+    asked: Callable[[Tried], tuple[Mapping[str, float], bool]],
+    name: str,
+) -> Tried:
+    """The adjustment begun with the factors of focal lengths that are asked for, again and again
+    as long as it fits; `name` tells these beginnings from others.
+    """
+    best = last
     for again in range(FOCALS_AGAIN):
-        multiples, sure = survey.focals(best)
-        if not multiples:
+        factors, sure = asked(best)
+        if not factors:
             break
-        focals = {**best.begun.focals, **multiples}
-        other = survey.tried(best.begun, focals=focals, name=f"focal {again} ")
+        focals = {**best.begun.focals, **factors}
+        other = survey.tried(best.begun, focals=focals, name=f"{name} {again} ")
         fits = fits_as_well if sure else fits_cut
         if not fits(other.found, best.found):
             break
-        best, notes = other, focal_notes(other.found, focals)
-    return replace(best, notes=(*last.notes, *notes))
+        best = replace(other, notes=last.notes)
+    return best
 
 
 def _false_views(last: Tried, survey: Survey) -> Tried:
@@ -304,18 +318,7 @@ def _found_directions(last: Tried, survey: Survey) -> Tried:
 
 def _false_focals(last: Tried, survey: Survey) -> Tried:
     """Focal lengths that files tell and pictures contradict are guesses, too."""
-    best = last
-    for again in range(FOCALS_AGAIN):
-        multiples, sure = survey.false_focals(best)
-        if not multiples:
-            break
-        focals = {**best.begun.focals, **multiples}
-        other = survey.tried(best.begun, focals=focals, name=f"told {again} ")
-        fits = fits_as_well if sure else fits_cut
-        if not fits(other.found, best.found):
-            break
-        best = replace(other, notes=last.notes)
-    return best
+    return _other_focals(last, survey, survey.false_focals, "told")
 
 
 def _unfit_cameras(last: Tried, survey: Survey) -> Tried:
