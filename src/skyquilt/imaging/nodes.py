@@ -323,6 +323,18 @@ def node_places(
     return x, y, surface.at(x, y)
 
 
+def even_places(
+    surface: Surface, bounds: tuple[float, float, float, float], number: float
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """x, y, z in m, each (r, c), of about so many places of the ground, evenly spread inside bounds
+    (west, south, east, north) in m.
+    """
+    west, south, east, north = bounds
+    step = np.sqrt((east - west) * (north - south) / number)
+    x, y = np.meshgrid(np.arange(west, east, step), np.arange(south, north, step))
+    return x, y, surface.at(x, y)
+
+
 def overlapping(views: Sequence[View], x: NDArray[Any], y: NDArray[Any]) -> list[View]:
     """The views whose footprint's bounding box intersects that of nodes at x, y (r, c) in m, rows
     southwards.

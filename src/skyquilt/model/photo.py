@@ -243,14 +243,16 @@ class Photo:
     @property
     def lens_guessed(self) -> bool:
         """Whether nothing tells the lens, so that its focal length is a guess."""
-        told = self.calibration is not None or self.shown_lens is not None
-        return not told and self.focal.source == "guess"
+        return self._uncalibrated and self.focal.source == "guess"
 
     @property
     def focal_alone(self) -> bool:
         """Whether its focal length is all that is told of the lens."""
-        told = self.calibration is not None or self.shown_lens is not None
-        return not told and self.focal.source != "guess"
+        return self._uncalibrated and self.focal.source != "guess"
+
+    @property
+    def _uncalibrated(self) -> bool:
+        return self.calibration is None and self.shown_lens is None
 
     @property
     def shows_a_band(self) -> bool:

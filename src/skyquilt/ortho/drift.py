@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.nodes import View, project_nodes
+from skyquilt.imaging.nodes import View, even_places, project_nodes
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.frame_pattern import FramePattern, Samples
 
@@ -71,7 +71,7 @@ class Drift:
         usable = [v for v in views if v.photo in thumbnails]
         if len(usable) < 2:
             return {}
-        s = self._samples(usable, thumbnails, surface, bounds)
+        s = ground_samples(usable, thumbnails, surface, bounds, self.points)
         edges = overlaps(s.point, s.row, s.value, self.least)
         if not len(edges.first):
             return {}
@@ -97,20 +97,11 @@ class Drift:
         for own in cameras.values():
             if len(own) < self.pattern.fewest:
                 continue
-            pattern = self.pattern(self._samples(own, thumbnails, surface, bounds), own[0].camera)
+            samples = ground_samples(own, thumbnails, surface, bounds, self.points)
+            pattern = self.pattern(samples, own[0].camera)
             if pattern is not None:
                 found |= {v.photo: pattern for v in own}
         return found
-
-    def _samples(
-        self,
-        views: Sequence[View],
-        thumbnails: Mapping[int, NDArray[Any]],
-        surface: Surface,
-        bounds: tuple[float, float, float, float],
-    ) -> Samples:
-        """Values of views at points of the ground."""
-        return ground_samples(views, thumbnails, surface, bounds, max(self.points, 40 * len(views)))
 
 
 def ground_samples(
@@ -121,12 +112,9 @@ def ground_samples(
     points: int,
 ) -> Samples:
     """Values of views, from thumbnails (h, w) of their photos, at about so many points of the
-    ground inside bounds (west, south, east, north) in m.
+    ground, and more of many views, inside bounds (west, south, east, north) in m.
     """
-    west, south, east, north = bounds
-    step = np.sqrt((east - west) * (north - south) / points)
-    x, y = np.meshgrid(np.arange(west, east, step), np.arange(south, north, step))
-    z = surface.at(x, y)
+    x, y, z = even_places(surface, bounds, max(points, 40 * len(views)))
     parts = []
     for row, view in enumerate(views):
         nodes = project_nodes(view, x, y, z)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.engine.kept import MADE_NOW, Keep
-from skyquilt.imaging.nodes import View, project_nodes
+from skyquilt.imaging.nodes import View, even_places, project_nodes
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.differences import (
     CORRELATED,
@@ -332,9 +332,7 @@ class Balance:
         seen_by = sum(cv2.contourArea(v.footprint.astype(np.float32)) for v in views) / area
         few = min(each, SAMPLES * len(views) / max(seen_by, 1e-9))
         number = max(self.points, few)
-        step = np.sqrt(area / number)
-        x, y = np.meshgrid(np.arange(west, east, step), np.arange(south, north, step))
-        z = surface.at(x, y)
+        x, y, z = even_places(surface, bounds, number)
         point, row, place, value = [], [], [], []
         for index, view in enumerate(views):
             keep.tell(f"brightness {index + 1} of {len(views)}")

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.nodes import View, project_nodes
+from skyquilt.imaging.nodes import View, even_places, project_nodes
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.exposure import Exposure, image_place
 
@@ -32,10 +32,7 @@ def tone_residual(
     photos show: median and 95th percentile over the cells, in grey values or in the unit of
     measured values. None if no cell is shared.
     """
-    west, south, east, north = bounds
-    step = np.sqrt((east - west) * (north - south) / POINTS)
-    x, y = np.meshgrid(np.arange(west, east, step), np.arange(south, north, step))
-    z = surface.at(x, y)
+    x, y, z = even_places(surface, bounds, POINTS)
     number, total, squares = (np.zeros(x.size) for _ in range(3))
     for view in views:
         if view.photo not in thumbnails:

@@ -169,8 +169,8 @@ def _open(found: Rigged, ground: Ground) -> Rigged:
         return found
     marks, said = marks_in(found.photos, views, frames, ground)
     found = replace(found, marks=marks, notes=said)
-    many = max(Drift.points, 40 * len(views))
-    shut = closed_frames(ground_samples(views, frames, ground.surface, ground.grid.bounds, many))
+    samples = ground_samples(views, frames, ground.surface, ground.grid.bounds, Drift.points)
+    shut = closed_frames(samples)
     if len(views) - len(shut) < FindRig.minimum:
         return found
     for k in sorted(shut):
