@@ -1,12 +1,15 @@
+import pickle
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 
+import cloudpickle
 import numpy as np
 import pytest
 
 from skyquilt.engine import pixel_cache
 from skyquilt.engine.pixel_cache import PhotoParts, PixelCache
+from skyquilt.geometry import set_aside
 
 
 def cache(budget, read=None):
@@ -182,9 +185,71 @@ def test_what_was_not_foreseen_is_decoded_again_and_then_kept(asked):
     assert read == ([7, 7] if asked else [7])
 
 
-def test_parts_give_way_to_others_within_the_budget():
-    box = (slice(0, 10), slice(0, 10))
-    parts, read = parts_of({i: {(0, 0): box} for i in range(4)}, budget=2 * 800)
+BOX = (slice(0, 10), slice(0, 10))
+
+
+def test_parts_that_give_way_to_others_wait_in_files():
+    parts, read = parts_of({i: {(0, 0): BOX} for i in range(4)}, budget=2 * 800)
+    for i in (0, 1, 0, 2, 0, 1, 3, 2):
+        assert np.array_equal(parts(i, *BOX), photo(i)[BOX])
+    assert read == [0, 1, 2, 3] and parts._kept._bytes == 2 * 800
+    with pytest.raises(ValueError, match="read-only"):
+        parts(1, *BOX)[0, 0] = 1
+    parts.done((0, 0))
+    assert not parts._aside and not parts._kept._kept
+
+
+def test_of_photos_that_fill_the_memory_alone_none_stays_there(monkeypatch):
+    monkeypatch.setattr(pixel_cache, "LEAST_BYTES", 700)
+    parts, read = parts_of({i: {(0, 0): BOX, (0, 1): BOX} for i in range(2)})
+    for step in ((0, 0), (0, 1)):
+        for i in (0, 1):
+            assert np.array_equal(parts(i, *BOX), photo(i)[BOX])
+        assert parts._kept._bytes == 0 and len(parts._aside) == 2
+        parts.done(step)
+    assert read == [0, 1] and not parts._aside and not parts._kept._kept
+
+
+@pytest.mark.parametrize("fault", ["full", "refused", "gone"])
+def test_without_room_on_disk_photos_are_decoded_again(monkeypatch, fault):
+    def refuses(*_, **__):
+        raise OSError(fault)
+
+    if fault == "full":
+        monkeypatch.setattr(pixel_cache, "LEFT_FREE_BYTES", 2**62)
+    elif fault == "refused":
+        monkeypatch.setattr(set_aside, "TemporaryFile", refuses)
+    else:
+        monkeypatch.setattr(pixel_cache.shutil, "disk_usage", refuses)
+    parts, read = parts_of({i: {(0, 0): BOX} for i in range(4)}, budget=2 * 800)
     for i in (0, 1, 0, 2, 0, 1):
-        parts(i, *box)
+        assert np.array_equal(parts(i, *BOX), photo(i)[BOX])
     assert read == [0, 1, 2, 1] and parts._kept._bytes == 2 * 800
+
+
+def test_what_a_part_in_a_file_lacks_is_decoded_again():
+    parts, read = parts_of({i: {(0, 0): BOX} for i in range(3)}, budget=800)
+    for i in (0, 1, 2):
+        parts(i, *BOX)
+    wider = (slice(0, 12), slice(2, 20))
+    assert np.array_equal(parts(0, *wider), photo(0)[wider])
+    assert read == [0, 1, 2, 0]
+
+
+def test_a_copy_for_another_process_begins_empty():
+    parts, read = parts_of({i: {(0, 0): BOX} for i in range(3)}, budget=800)
+    for i in (0, 1, 2):
+        parts(i, *BOX)
+    copy = pickle.loads(cloudpickle.dumps(parts))
+    assert not copy._aside and not copy._kept._kept
+    assert np.array_equal(copy(1, *BOX), photo(1)[BOX]) and read == [0, 1, 2]
+
+
+def test_threads_share_parts_in_files():
+    parts, read = parts_of({i: {(0, 0): BOX} for i in range(6)}, budget=800)
+    with ThreadPoolExecutor(8) as pool:
+        found = pool.map(
+            lambda i: np.array_equal(parts(i % 6, *BOX), photo(i % 6)[BOX]), range(600)
+        )
+        assert all(found)
+    assert len(read) <= 6 * 8

@@ -1,19 +1,25 @@
 """Cache of decoded photos, or of what was computed from them, within a memory budget."""
 
+import shutil
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from tempfile import gettempdir
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.engine.memory_watch import resident_bytes
+from skyquilt.geometry.set_aside import InFile, folder_on_disk
 from skyquilt.settings import USUAL_GB
 
 LEAST_BYTES = 150_000_000
 """Bytes of decoded photos that are kept whatever else is in memory."""
+LEFT_FREE_BYTES = 2_000_000_000
+"""Bytes of disk that are left to others."""
 MOST_OF = 0.8
 """Share of what is held from which it is not worth a copy to hold less."""
 Box = tuple[slice, slice]
@@ -49,6 +55,8 @@ class PixelCache(Generic[Kept]):
     """Resident memory of the process above which fewer are kept, but at least `LEAST_BYTES`; 0 = as
     many as the budget allows.
     """
+    leaving: Callable[[int, Kept], None] | None = None
+    """Hears of each photo that is dropped for others."""
     decoded: int = 0
     """How many times a photo was decoded."""
     dropped: int = 0
@@ -64,6 +72,7 @@ class PixelCache(Generic[Kept]):
             "read": self.read,
             "budget_bytes": self.budget_bytes,
             "resident_bytes": self.resident_bytes,
+            "leaving": self.leaving,
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -95,17 +104,26 @@ class PixelCache(Generic[Kept]):
 
     def put(self, photo: int, pixels: Kept) -> None:
         """Keeps pixels that the caller decoded, if they fit."""
+        for left in self._put(photo, pixels):
+            if self.leaving is not None:
+                self.leaving(*left)
+
+    def _put(self, photo: int, pixels: Kept) -> list[tuple[int, Kept]]:
+        """Keeps pixels; those that are dropped for them."""
+        out: list[tuple[int, Kept]] = []
         with self._lock:
             self.decoded += 1
             if pixels.nbytes > self.budget_bytes:
-                return
+                return out
             self._bytes += pixels.nbytes - (self._kept[photo].nbytes if photo in self._kept else 0)
             self._kept[photo] = pixels
             self._kept.move_to_end(photo)
             allowed = self._allowed()
             while self._bytes > allowed and len(self._kept) > 1:
-                self._bytes -= self._kept.popitem(last=False)[1].nbytes
+                out.append(self._kept.popitem(last=False))
+                self._bytes -= out[-1][1].nbytes
                 self.dropped += 1
+        return out
 
     def _allowed(self) -> int:
         """Bytes that may be kept now."""
@@ -149,11 +167,13 @@ class _Part:
     """Row of the photo that is the first."""
     column: int
     """Column of the photo that is the first."""
+    file: InFile | None = None
+    """The file that holds the pixels; None = they are in memory."""
 
     @property
     def nbytes(self) -> int:
         """Bytes in memory."""
-        return int(self.pixels.nbytes)
+        return int(self.pixels.nbytes) if self.file is None else 0
 
     def within(self, rows: slice, columns: slice) -> NDArray[Any] | None:
         """Rows and columns of the photo; None where the part does not hold all of them."""
@@ -164,7 +184,9 @@ class _Part:
         return self.pixels[top:bottom, left:right] if inside else None
 
     def cut(self, box: Box) -> "_Part":
-        """A copy of what it holds of a box; itself where that is nearly all of it."""
+        """A copy of what it holds of a box; itself where that is nearly all of it, or in a file."""
+        if self.file is not None:
+            return self
         top, left = (
             max(s.start - at, 0) for s, at in zip(box, (self.row, self.column), strict=True)
         )
@@ -178,7 +200,8 @@ class _Part:
 
 class PhotoParts:
     """The parts of decoded photos that the steps of a work still ask for, within a memory budget.
-    Thread-safe.
+    What finds no room in memory waits in temporary files: reading there costs a twentieth of
+    decoding, and of photos of 48 megapixels hardly two have room. Thread-safe.
     """
 
     def __init__(
@@ -197,15 +220,28 @@ class PhotoParts:
             for step in steps:
                 self._shows.setdefault(step, []).append(photo)
         self._kept = PixelCache(
-            read=self._cut, budget_bytes=like.budget_bytes, resident_bytes=like.resident_bytes
+            read=self._cut,
+            budget_bytes=like.budget_bytes,
+            resident_bytes=like.resident_bytes,
+            leaving=self._put_aside,
         )
+        self._aside: dict[int, _Part] = {}
+        self._writing = threading.Lock()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy in another process begins empty."""
+        return self.__dict__ | {"_aside": {}, "_writing": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._writing = threading.Lock()
 
     def __call__(self, photo: int, rows: slice, columns: slice) -> NDArray[Any]:
         """Pixels of these rows and columns of a photo, read-only."""
-        while (found := self._kept(photo).within(rows, columns)) is None:
+        while (found := self._part(photo).within(rows, columns)) is None:
             more = self._asked.setdefault(photo, {})
             more[UNFORESEEN] = _around([(rows, columns), *more.values()])
-            self._kept.drop(photo)
+            self._drop(photo)
         return found
 
     def done(self, step: Step) -> None:
@@ -214,17 +250,51 @@ class PhotoParts:
             asked = self._asked[photo]
             asked.pop(step, None)
             if not asked.keys() - {UNFORESEEN}:
-                self._kept.drop(photo)
+                self._drop(photo)
             elif (held := self._kept.peek(photo)) is not None:
                 part = held.cut(_around([*asked.values()]))
                 if part is not held:
                     self._kept.put(photo, part)
+        for part in [*self._aside.values()]:
+            if part.file is not None:
+                part.file.release()
+
+    def _part(self, photo: int) -> _Part:
+        """What is held of a photo; it is decoded if that is nothing."""
+        return self._aside.get(photo) or self._kept(photo)
+
+    def _put_aside(self, photo: int, part: _Part) -> None:
+        """Puts a part that steps still ask for into a file, where there is disk for it."""
+        with self._writing:
+            if photo in self._aside or not self._asked.get(photo):
+                return
+            if not _room_on_disk():
+                return
+            file = InFile(part.pixels)
+            if file.values is not part.pixels:
+                self._aside[photo] = replace(part, pixels=file.values, file=file)
+
+    def _drop(self, photo: int) -> None:
+        """Drops what is held of a photo."""
+        self._kept.drop(photo)
+        self._aside.pop(photo, None)
 
     def _cut(self, photo: int) -> _Part:
         whole = self._read(photo)
         part = _Part(pixels=whole, row=0, column=0)
+        if whole.nbytes > LEAST_BYTES:  # there may never be room for two of them
+            self._put_aside(photo, part)
         asked = self._asked.get(photo)
-        return part.cut(_around([*asked.values()])) if asked else part
+        if not asked or photo in self._aside:
+            return self._aside.get(photo, part)
+        return part.cut(_around([*asked.values()]))
+
+
+def _room_on_disk() -> bool:
+    """Whether there is disk for a decoded photo."""
+    with suppress(OSError):
+        return shutil.disk_usage(folder_on_disk() or gettempdir()).free > LEFT_FREE_BYTES
+    return False
 
 
 def _around(boxes: Sequence[Box]) -> Box:
