@@ -18,6 +18,7 @@ from skyquilt.alignment.dominant_plane import dominant_normal, levelled
 from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.oblique import (
     found_oblique,
+    hung,
     looked_at,
     reported_oblique,
     resected,
@@ -27,7 +28,7 @@ from skyquilt.geometry.camera import project, rays
 from skyquilt.geometry.frames import cam_R_map_from_angles, rotation_from_vector
 from skyquilt.matching.candidates import Nearest
 from skyquilt.model.camera import Camera
-from skyquilt.model.features import Features
+from skyquilt.model.features import Features, Link
 from skyquilt.model.poses import Alignment, MapFrame, Pose, TiePoints
 from tests.alignment.surveys import photo, prior
 
@@ -242,6 +243,49 @@ def test_a_photo_that_fell_elsewhere_is_hung_on_the_others_again():
     assert found_oblique(replace(done, poses=far), {}, untold, lost) == frozenset()
     most = {i: pose(-16, 41, z=77, pitch=20) for i in range(9)}
     assert found_oblique(replace(done, poses=done.poses | most), {}, priors, lost) == frozenset()
+
+
+@pytest.mark.parametrize(
+    ("away_m", "turned_deg", "placed"),
+    [
+        (0.0, 0.0, True),
+        (40.0, 0.0, True),
+        (0.0, 25.0, True),
+        (3.0, 25.0, True),
+        (40.0, 25.0, False),
+    ],
+)
+def test_tie_points_do_not_put_an_oblique_photo_far_from_all_that_it_reports(
+    away_m, turned_deg, placed
+):
+    """Ground that looks alike elsewhere does so, with few matches but consistent ones."""
+    done = block(LAWN, hills(6000))
+    where = pose(0, -25, pitch=45)
+    own = done.ties.photo == 7
+    seen_px, good = seen(where, done.ties.xyz[done.ties.point[own]])
+    px = np.concatenate([done.ties.px[own][good], seen_px[good]])
+    some = [
+        Features(
+            px=at, size=np.ones(len(at)), descriptors=np.zeros((len(at), 4), np.uint8), scale=1.0
+        )
+        for at in np.split(px, 2)
+    ]
+    index = np.arange(len(some[0].px), dtype=np.uint16)
+    link = Link(a=7, b=15, index_a=index, index_b=index, b_S_a=1 + 0j)
+    blank = replace(some[0], px=np.zeros((0, 2)))
+    features = [some[0] if i == 7 else blank for i in range(15)] + [some[1]]
+    told = prior(where.map_C + [away_m, 0, 0], yaw=0.0, pitch=45.0 + turned_deg)
+    priors = [prior(p.map_C, yaw=0.0) for p in LAWN] + [replace(told, sigma_C=np.full(3, 0.02))]
+    photos = [replace(photo(f"{i}.jpg"), camera_key="c") for i in range(16)]
+    found = hung(done, {}, photos, priors, features, [link], frozenset({15}))
+    assert (15 in found.poses) == placed
+    if placed:
+        assert np.linalg.norm(found.poses[15].map_C - where.map_C) < 0.01
+    else:
+        assert found.rejected[15] == (
+            "its tie points would put it 40 m from its position and turn it by 25 degrees from"
+            " what it reports"
+        )
 
 
 def test_photos_without_angles_lie_elsewhere_where_they_lost_their_matches():

@@ -32,6 +32,10 @@ told apart.
 """
 FAR_OFF, TURNED_DEG = 8.0, 10.0
 """A photo so many deviations from its position, and turned so far from its angles, is elsewhere."""
+ELSEWHERE = 0.1
+"""And so far from its position, as a share of its height above the ground: compasses and fixes of
+RTK that are lost do not move a photo as far.
+"""
 MOST_KEPT, FEW_KEPT = 0.8, 0.62
 """Photos that keep a larger share of their matches lie where they belong, however they look; with
 less than the second they lie elsewhere. Of 99 right ones of five surveys by hand, from a kite and
@@ -165,8 +169,8 @@ def hung(
         counted = {i: _points_of(i, alignment, features, links) for i in sorted(left)}
         best = max(sorted(left), key=lambda i: len(counted[i][0]))
         left.remove(best)
-        least, scale = least_covered(priors[best]), features[best].scale
-        alignment = _placed(alignment, best, photos[best], *counted[best], scale, least)
+        scale = features[best].scale
+        alignment = _placed(alignment, best, photos[best], priors[best], *counted[best], scale)
     return alignment
 
 
@@ -243,10 +247,10 @@ def _placed(
     alignment: Alignment,
     photo: int,
     about: Photo,
+    prior: Prior,
     point: NDArray[np.int64],
     px: Array,
     scale: float,
-    least: float,
 ) -> Alignment:
     """The alignment with one more photo, or with the reason why it is left out."""
     camera = alignment.cameras.get(about.camera_key, about.lens)
@@ -259,7 +263,9 @@ def _placed(
         )
         return replace(alignment, rejected=alignment.rejected | {photo: why})
     error = project(camera, pose.to_camera(xyz)) - px
+    least = least_covered(prior)
     why = why_weak(pose, camera, xyz[good], px[good], error[good], None, least=least)
+    why = why or _why_elsewhere(pose, prior, alignment.ground_m)
     if why:
         return replace(alignment, rejected=alignment.rejected | {photo: why})
     key = about.camera_key
@@ -281,6 +287,21 @@ def _placed(
         blocks=tuple(blocks),
         ties=_with_observations(alignment.ties, photo, point[good], px[good], error[good]),
         rejected={i: w for i, w in alignment.rejected.items() if i != photo},
+    )
+
+
+def _why_elsewhere(pose: Pose, prior: Prior, ground_m: float) -> str:
+    """Why a photo that reports to be oblique is not where tie points put it; empty where it may be:
+    ground that looks alike elsewhere puts it far from where it reports to lie and to look.
+    """
+    if not tilted(prior) or not _contradicts(pose, prior):
+        return ""
+    away = float(np.linalg.norm(pose.map_C - prior.map_C))
+    if away < ELSEWHERE * (pose.map_C[2] - ground_m):
+        return ""
+    return (
+        f"its tie points would put it {away:.0f} m from its position and turn it by"
+        f" {turned_deg(pose, prior):.0f} degrees from what it reports"
     )
 
 
