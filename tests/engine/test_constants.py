@@ -98,7 +98,10 @@ IN_NO_KEY = {
 BY_VALUE = {
     f"skyquilt.ortho.{name}": "what photos show badly is in the key of the seams, by value"
     for name in ("sharpness", "spoilt", "lasting_marks", "veiled")
-} | {"skyquilt.ortho.palettes": "what is told of palettes is told anew by every run"}
+} | {
+    "skyquilt.ortho.palettes": "what is told of palettes is told anew by every run",
+    "skyquilt.matching.straightened": "its function is in the recipe of features",
+}
 """Modules whose constants no method's key holds, and why that is right."""
 
 

@@ -44,6 +44,12 @@ fisheyes of 118 to 153 degrees, at most as many for pinholes.
 """
 CERTAIN = 20
 """And at least so many more."""
+PLAIN = 2.0
+"""The same from which a lens is a pinhole's whatever else."""
+STRAIGHT = 1.5
+"""So many times as many inliers as their links have must consecutive photos share through a
+fisheye, with pictures that are straightened as such, where they are hardly linked.
+"""
 FOCALS = (1.0, 0.8, 0.65)
 """Multiples of the reported focal length that are tried: a guess may be far off, and 35 mm
 equivalents of fisheyes are given by the field of view as well as by the focal length.
@@ -115,6 +121,10 @@ Matched = Callable[[int, int], tuple[Px, Px]]
 """Places (n, 2) in px of the matches of two photos (numbers), in each."""
 
 
+Shared = Callable[[int, int, Camera], int]
+"""Inliers of two photos (numbers) whose pictures are straightened as those of such a fisheye."""
+
+
 def fisheyes(
     cameras: Mapping[int, str],
     asked: Mapping[str, Camera],
@@ -122,11 +132,12 @@ def fisheyes(
     links: Sequence[Link],
     tried: Sequence[tuple[int, int]],
     matched: Matched,
+    shared: Shared | None = None,
 ) -> dict[str, Camera]:
     """The lenses of cameras that prove to have a fisheye, among those `asked`, with their reported
     lenses. `cameras`: of each photo by its number, as `features` are; `links`: as found with
     pinholes; `tried`: all pairs that were compared, by which a camera is judged that has hardly
-    a link.
+    a link. With `shared`, it is asked of cameras with fewer links than photos, too.
     """
     found = {}
     for key, lens in asked.items():
@@ -139,17 +150,32 @@ def fisheyes(
             pairs = [inside[n] for n in _spread(len(inside))]
         else:
             straighter, multiple = _straighter(lens, features, some)
-        if straighter >= SUSPECT:
-            continue
-        px, scale = [matched(*pair) for pair in pairs], features(min(own)).scale
-        fisheye = (
-            _unless_closer(lens, multiple, px, scale)
-            if straighter < EVIDENT
-            else _judged(lens, px, scale)
-        )
+        fisheye = None
+        if straighter < SUSPECT:
+            px, scale = [matched(*pair) for pair in pairs], features(min(own)).scale
+            fisheye = (
+                _unless_closer(lens, multiple, px, scale)
+                if straighter < EVIDENT
+                else _judged(lens, px, scale)
+            )
+        unsure = fisheye is None and straighter < PLAIN and len(linked) < len(own)
+        if unsure and shared is not None:
+            fisheye = _shown_straight(lens, sorted(own), linked, shared)
         if fisheye is not None:
             found[key] = fisheye
     return found
+
+
+def _shown_straight(
+    lens: Camera, own: Sequence[int], links: Sequence[Link], shared: Shared
+) -> Camera | None:
+    """The fisheye through which consecutive photos share most, if clearly more than their links."""
+    pairs = [(own[n], own[n + 1]) for n in _spread(len(own) - 1)]
+    linked = sum(len(k) for k in links if (k.a, k.b) in pairs)
+    bent = [as_fisheye(lens, m) for m in FOCALS]
+    counts = [sum(shared(*pair, c) for pair in pairs) for c in bent]
+    best = int(np.argmax(counts))
+    return bent[best] if counts[best] >= max(STRAIGHT * linked, linked + CERTAIN) else None
 
 
 def _spread(count: int, most: int = LOOKED_AT) -> list[int]:

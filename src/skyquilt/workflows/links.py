@@ -30,6 +30,7 @@ from skyquilt.model.poses import MapFrame, Prior
 from skyquilt.ortho.tie_surface import level
 from skyquilt.workflows.methods import Methods
 from skyquilt.workflows.photo_features import FeaturedPhotos, GreyPictures, features_recipe
+from skyquilt.workflows.straightened import Straightened
 
 
 class ExpectedPlaces:
@@ -285,7 +286,7 @@ def of_unknown_kind(photos: Sequence[Photo]) -> dict[str, Camera]:
 
 
 def with_fisheyes(
-    found: FeaturedPhotos, links: Links, methods: Methods
+    found: FeaturedPhotos, links: Links, grey: GreyPictures, methods: Methods, store: Store
 ) -> tuple[FeaturedPhotos, tuple[str, ...]]:
     """The photos, those of cameras that prove to have a fisheye with such a lens, and notes on
     them; the same where there are none. Links must be found again for these.
@@ -300,17 +301,27 @@ def with_fisheyes(
         matches = _on_ground(matcher(*two), marked)
         return two[0].px[matches.index_a], two[1].px[matches.index_b]
 
+    straight = Straightened(found.photos, grey, methods.detector, store)
+
+    def shared(a: int, b: int, lens: Camera) -> int:
+        two = straight(a, lens), straight(b, lens)
+        matches = _on_ground(matcher(*two), marked_in(links.marks, found.photos, (a, b), two))
+        link = methods.verify(a, b, *two, matches, lens.width, (lens, lens))
+        return len(link) if isinstance(link, Link) else 0
+
     tried = [(k.a, k.b) for k in links.links] + [(k.a, k.b) for k in links.rejected]
     asked = of_unknown_kind(found.photos)
     cameras = {i: p.camera_key for i, p in enumerate(found.photos)}
-    lenses = fisheyes(cameras, asked, features.__getitem__, links.links, tried, matched)
+    lenses = fisheyes(cameras, asked, features.__getitem__, links.links, tried, matched, shared)
     if not lenses:
         return found, ()
     photos = tuple(
         replace(p, shown_lens=lenses[p.camera_key]) if p.camera_key in lenses else p
         for p in found.photos
     )
-    return replace(found, photos=photos), tuple(fisheye_note(camera) for camera in lenses)
+    return replace(found, photos=photos, straight=straight), tuple(
+        fisheye_note(camera) for camera in lenses
+    )
 
 
 def link_photos(

@@ -18,6 +18,8 @@ from skyquilt.engine.store import Store, digest
 from skyquilt.engine.workers import Workers
 from skyquilt.errors import NoPhotosError, OutputError, PhotoFailedError, UnreadablePhotoError
 from skyquilt.imaging.grey import detail, halved, shrink, to_grey8
+from skyquilt.matching.straightened import straightened_features
+from skyquilt.model.camera import Camera
 from skyquilt.model.features import Features
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.ortho.palettes import palette_notes
@@ -76,6 +78,8 @@ class FeaturedPhotos:
     """Gives the features found in a second look (`workflows.second_look`)."""
     again: frozenset[int] = frozenset()
     """Photos that were looked at twice."""
+    straight: Callable[[int, Camera], Features] | None = None
+    """Gives the features of photos of fisheyes."""
 
     @property
     def features(self) -> Sequence[Features]:
@@ -113,7 +117,12 @@ class _FeaturesOf(Sequence[Features]):
         if isinstance(photo, slice):
             return [self[i] for i in range(*photo.indices(len(self)))]
         found = self._found
-        features = found.looks(found.number[photo]).features
+        lens = found.photos[photo].lens
+        features = (
+            found.straight(photo, lens)
+            if found.straight is not None and lens.fisheye
+            else found.looks(found.number[photo]).features
+        )
         if found.closer is None or photo not in found.again:
             return features
         return features.followed_by(found.closer(photo))
@@ -267,7 +276,7 @@ def features_key(photo: Photo, detector: Detector) -> str:
 
 def features_recipe(detector: Detector) -> tuple[Any, ...]:
     """Everything on which features and thumbnails depend, except for their photos."""
-    return detector, THUMBNAIL, detail, *picture_recipe()
+    return detector, THUMBNAIL, detail, straightened_features, *picture_recipe()
 
 
 def picture_key(photo: Photo) -> str:

@@ -1,0 +1,64 @@
+"""Features of the photos of fisheyes, found in their straightened pictures."""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from numpy.typing import NDArray
+
+from skyquilt.engine.pixel_cache import PixelCache
+from skyquilt.engine.store import Store, digest
+from skyquilt.matching.straightened import straightened_features
+from skyquilt.model.camera import Camera
+from skyquilt.model.features import Features
+from skyquilt.model.photo import Photo
+from skyquilt.workflows.methods import Detector
+from skyquilt.workflows.photo_features import KEPT_BYTES, PICTURE, GreyPictures, features_recipe
+
+
+@dataclass(frozen=True)
+class _Straight:
+    """Features, with what they take."""
+
+    features: Features
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes in memory."""
+        return sys.getsizeof(self.features)
+
+
+class Straightened:
+    """Features found in grey images that are straightened (`matching.straightened`), from the
+    store.
+    """
+
+    def __init__(
+        self, photos: Sequence[Photo], grey: GreyPictures, detector: Detector, store: Store
+    ) -> None:
+        self._photos, self._grey, self._detector, self._store = photos, grey, detector, store
+        self._lenses: dict[int, Camera] = {}
+        self._kept = PixelCache(read=self._found, budget_bytes=KEPT_BYTES)
+
+    def __call__(self, photo: int, lens: Camera) -> Features:
+        """Features of a photo (index) with a fisheye."""
+        if self._lenses.get(photo) != lens:
+            self._kept.drop(photo)
+            self._lenses[photo] = lens
+        return self._kept(photo).features
+
+    def _found(self, photo: int) -> _Straight:
+        own, lens = self._photos[photo], self._lenses[photo]
+
+        def found() -> Features:
+            def of(pixels: NDArray[Any]) -> Features:
+                return self._detector.of_shrunken(pixels, pixels.shape[:2])
+
+            longest, full = self._detector.longest, (own.height, own.width)
+            return straightened_features(lens, self._grey(photo, PICTURE), full, longest, of)
+
+        recipe = features_recipe(self._detector)
+        return _Straight(
+            self._store.get_or("features", digest(own.pixels_key, "straight", lens, recipe), found)
+        )
