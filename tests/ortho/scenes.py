@@ -2,7 +2,7 @@
 it.
 """
 
-from functools import cache
+from functools import cache, lru_cache
 
 import cv2
 import numpy as np
@@ -26,8 +26,14 @@ CAMERA = Camera(
 )
 FINE_M = 0.025
 """Ground size of a texture pixel in m."""
-GROUND = np.clip(texture(3200, 3200, seed=11, roughness=1.2), 5, 250).astype(np.float32)
-"""80 m x 80 m about the origin, row 0 in the north."""
+
+
+@cache
+def textured():
+    """Ground of 80 m x 80 m about the origin, row 0 in the north; not to be written to."""
+    ground = np.clip(texture(3200, 3200, seed=11, roughness=1.2), 5, 250).astype(np.float32)
+    ground.setflags(write=False)
+    return ground
 
 
 def view(number, x, y, *, z=40.0, yaw=0.0, pitch=0.0, roll=0.0, camera=CAMERA, surface=FLAT):
@@ -59,10 +65,23 @@ def _on_ground(shot, xy):
     return shot.pose.map_C[:2] - d[:, :2] * (shot.pose.map_C[2] / d[:, 2])[:, None]
 
 
-def photograph(shot, ground=GROUND):
+def photograph(shot, ground=None):
     """The photo's picture: every pixel the mean of 3 x 3 rays into the ground."""
-    h, w = shot.camera.height, shot.camera.width
-    R, (x, y, z) = shot.pose.cam_R_map, shot.pose.map_C
+    R, C = shot.pose.cam_R_map, shot.pose.map_C
+    if ground is not None:
+        return _photographed(shot.camera, R, C, ground)
+    return _of_textured(shot.camera, tuple(R.ravel()), tuple(C)).copy()
+
+
+@lru_cache(maxsize=100)
+def _of_textured(camera, R, C):
+    """Many tests show the same photos."""
+    return _photographed(camera, np.reshape(R, (3, 3)), np.array(C), textured())
+
+
+def _photographed(camera, R, C, ground):
+    h, w = camera.height, camera.width
+    x, y, z = C
     across, down = ground.shape[1] / 2 - 0.5, ground.shape[0] / 2 - 0.5
     ground_H_rays = [
         (x * R[:, 2] - z * R[:, 0]) / FINE_M + across * R[:, 2],
@@ -70,7 +89,7 @@ def photograph(shot, ground=GROUND):
         R[:, 2],
     ]
     total = np.zeros((h, w), np.float32)
-    for rays in _sub_pixels(shot.camera):
+    for rays in _sub_pixels(camera):
         column, row, far = (np.array(ground_H_rays, np.float32) @ rays).reshape(3, h, w)
         at = column / far, row / far
         total += cv2.remap(ground, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
@@ -88,10 +107,11 @@ def _sub_pixels(camera):
     ]
 
 
-def truth(grid, ground=GROUND):
+def truth(grid):
     """The ground averaged over the pixels of a grid whose resolution is a multiple of the
     texture's.
     """
+    ground = textured()
     k = round(grid.gsd / FINE_M)
     top = round((ground.shape[0] / 2) - grid.north / FINE_M)
     left = round(ground.shape[1] / 2 + grid.west / FINE_M)

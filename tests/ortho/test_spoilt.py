@@ -20,7 +20,7 @@ from skyquilt.simulate import preset, simulate
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Route
 from skyquilt.workflows.mosaic import mosaic
-from tests.ortho.scenes import GROUND, photograph
+from tests.ortho.scenes import photograph, textured
 from tests.ortho.test_sharpness import flight, seen
 
 
@@ -112,7 +112,7 @@ def test_the_map_of_a_bracket_is_not_white_where_the_ground_is_not(tmp_path):
     assert (squares[whole] < 0.7).mean() < 0.001
 
 
-def pictures(alignment, ground=GROUND):
+def pictures(alignment, ground=None):
     """What each photo of a flight shows of a ground, (300, 400, 3)."""
     views = make_views(alignment, level(0.0))
     grey = {v.photo: photograph(v, ground) for v in views}
@@ -164,7 +164,7 @@ def test_a_cross_and_a_scale_yield_though_they_have_few_features():
 
 def test_a_road_that_the_drone_follows_is_no_mark():
     """It hardly varies while the fields beside it do, but other photos show it, too."""
-    ground = GROUND.copy()
+    ground = textured().copy()
     ground[1560:1640] = 230
     alignment = flight(12, apart=6.0)
     views = make_views(alignment, level(0.0))[:10]
@@ -232,7 +232,7 @@ def test_ground_that_two_photos_show_or_one_tells_of_no_spots(apart):
 
 def test_a_road_in_the_middle_of_every_picture_is_no_dust():
     """One line flown along a dark road: each photo has it at the same place, as has the ground."""
-    ground = GROUND.copy()
+    ground = textured().copy()
     ground[1540:1660] *= 0.6  # 3 m wide, along the line
     along = pictures(flight(10, apart=4.0), ground)
     middle = np.mean([p[140:160, 50:350].mean() / p.mean() for p in along.values()])

@@ -15,7 +15,7 @@ from skyquilt.ortho.fill import crowns, filled, lowered, nearest_known, plateaus
 from skyquilt.ortho.pair_matching import Footprints, pair_of
 from skyquilt.ortho.stereo import Stereo
 from skyquilt.ortho.tie_surface import level
-from tests.ortho.scenes import FINE_M, GROUND, view
+from tests.ortho.scenes import FINE_M, textured, view
 
 HEIGHT, BOX = 40.0, 6.0
 """Cameras above ground, and the box's roof above it, m."""
@@ -44,11 +44,12 @@ def picture(shot):
         z[near[inside]] = h
     t = (z - cz) / d[:, 2]
     x, y = cx + t * d[:, 0], cy + t * d[:, 1]
-    column = (x / FINE_M + GROUND.shape[1] / 2 + 37 * z / FINE_M * 0.1).astype(np.float32)
-    row = (GROUND.shape[0] / 2 - y / FINE_M + 29 * z / FINE_M * 0.1).astype(np.float32)
+    ground = textured()
+    column = (x / FINE_M + ground.shape[1] / 2 + 37 * z / FINE_M * 0.1).astype(np.float32)
+    row = (ground.shape[0] / 2 - y / FINE_M + 29 * z / FINE_M * 0.1).astype(np.float32)
     shape = (camera.height, camera.width)
     out = cv2.remap(
-        GROUND,
+        ground,
         column.reshape(shape),
         row.reshape(shape),
         cv2.INTER_LINEAR,

@@ -18,13 +18,13 @@ def spec_for(array, **options):
 
 
 def picture(height, width, bands=3):
-    y, x = np.mgrid[:height, :width]
+    y, x = np.ogrid[:height, :width]
     waves = [120 + 90 * np.sin(x / (17 + 9 * b)) * np.cos(y / (23 + 5 * b)) for b in range(bands)]
     return np.stack(waves, -1).astype(np.uint8)
 
 
 def disc(height, width):
-    y, x = np.mgrid[:height, :width]
+    y, x = np.ogrid[:height, :width]
     return ((y - height / 2) / height) ** 2 + ((x - width / 2) / width) ** 2 < 0.2
 
 

@@ -108,13 +108,13 @@ BODIES = {
     "places of no dimension": _feature(type="Polygon", coordinates=[[[]] * 4]),
     "places of nine dimensions": _feature(type="Polygon", coordinates=[[[1] * 9] * 4]),
     "off the Earth": _feature(type="Polygon", coordinates=[[[1e300, 1e300]] * 4]),
-    "a hundred thousand corners": _feature(
+    "a hundred thousand corners": lambda: _feature(
         type="Polygon",
         coordinates=[[[13 + (k % 7) / 9, 52 + (k % 11) / 9] for k in range(100_000)] + [[13, 52]]],
     ),
     "no geometry": _feature(),
     "UTF-16": json.dumps({"type": "FeatureCollection", "features": []}).encode("utf-16"),
-    "compressed": gzip.compress(b"[" * 10_000_000),
+    "compressed": lambda: gzip.compress(b"[" * 10_000_000),
     "a form": _multipart(b"\xff\xd8\xff"),
     "XML that grows": b'<!DOCTYPE a [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "'
     + b"&a;" * 1000
@@ -123,7 +123,7 @@ BODIES = {
     + b'">]><kml>&c;</kml>',
     "XML that reads": b'<!DOCTYPE a [<!ENTITY a SYSTEM "file:///etc/passwd">]><kml>&a;</kml>',
     "deep XML": b"<kml>" + b"<Folder>" * NEST,
-    "an archive of zeros": _zip("doc.kml", bytes(30_000_000)),
+    "an archive of zeros": lambda: _zip("doc.kml", bytes(30_000_000)),
     "an archive that climbs": _zip("../../a.kml", b"<kml/>"),
     "an empty database": _geopackage("DROP TABLE a;"),
     "a database of views": _geopackage(f"DROP TABLE a; CREATE VIEW a AS {ENDLESS};"),
@@ -161,7 +161,7 @@ BODIES = {
         " n AS organization_coordsys_id, '' AS definition FROM c WHERE n < 0;"
     ),
     "a star of 3,000 corners": _feature(type="Polygon", coordinates=[STAR]),
-    "two combs": json.dumps(
+    "two combs": lambda: json.dumps(
         {
             "type": "FeatureCollection",
             "features": [
@@ -177,6 +177,7 @@ BODIES = {
     "half a database": _geopackage("INSERT INTO a VALUES (1, zeroblob(9000));")[:-5000],
     "a megabyte of one letter": b"a" * 1_000_000,
 }
+"""Those that take long are made when they are sent."""
 PLACES = (
     ("PUT", "/areas"),
     ("POST", "/layers?name=a.geojson"),
@@ -207,7 +208,8 @@ SLOWEST_S = 5.0
 def attack(web, method, path):
     """Sends every body; returns what was answered with an error of the server, or late."""
     bad = []
-    for k, (name, body) in enumerate(BODIES.items()):
+    for k, (name, made) in enumerate(BODIES.items()):
+        body = made() if callable(made) else made
         headers = {"Content-Type": TYPES[k % len(TYPES)].encode("latin-1")}
         if name == "compressed":
             headers["Content-Encoding"] = "gzip"
