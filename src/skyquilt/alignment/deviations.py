@@ -145,18 +145,24 @@ def point_deviations(
     p, q = normal.Wp.shape[1], normal.Wc.shape[1]
     first = np.searchsorted(own.point, np.arange(len(points) + 1))
     out = np.full((len(points), 3), np.nan)
+    alike: dict[tuple[int, ...], list[tuple[int, int]]] = {}
     for k, point in enumerate(np.argsort(np.argsort(points)).tolist()):
-        seen = slice(first[point], first[point + 1])
-        photo = own.photo[seen]
+        shown = own.photo[first[point] : first[point + 1]].tolist()
+        alike.setdefault(tuple(shown), []).append((k, point))
+    # points that the same photos show need the same part of the covariance
+    for shown, some in alike.items():
+        photo = np.array(shown, np.int64)
         local = np.arange(p * len(photo))
         camera = len(local) + CAMERA * own.camera[photo][:, None] + np.arange(q)
         at = np.concatenate([local, camera.ravel()])
-        W = np.concatenate([normal.Wp[seen].reshape(-1, 3), normal.Wc[seen].reshape(-1, 3)])
-        V = normal.V[point] + 1e-9 * np.eye(3)
-        moved = np.linalg.solve(V, W.T)
         among = covariance.of(photo)[np.ix_(at, at)]
-        total = np.linalg.inv(V) + moved @ among @ moved.T
-        out[k] = np.sqrt(np.maximum(np.diag(total), 0.0))
+        for k, point in some:
+            seen = slice(first[point], first[point + 1])
+            W = np.concatenate([normal.Wp[seen].reshape(-1, 3), normal.Wc[seen].reshape(-1, 3)])
+            V = normal.V[point] + 1e-9 * np.eye(3)
+            moved = np.linalg.solve(V, W.T)
+            total = np.linalg.inv(V) + moved @ among @ moved.T
+            out[k] = np.sqrt(np.maximum(np.diag(total), 0.0))
     return out
 
 
