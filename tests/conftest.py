@@ -94,13 +94,38 @@ LONG = ("test_large_survey", "test_windows", "test_docs")
 """Files of tests that take a minute and more."""
 
 
+def further_cases(items: list[pytest.Item]) -> set[str]:
+    """Ids of slow tests that are further cases of a function: another one is quick, or a slow one
+    before them.
+    """
+    slow = [item for item in items if item.get_closest_marker("slow")]
+    run = [item for item in slow if not item.get_closest_marker("long")]
+    own = {item.nodeid: item.nodeid.partition("[")[0] for item in items}
+    known = {own[item.nodeid] for item in items if not item.get_closest_marker("slow")}
+    further = set()
+    for item in run:
+        if own[item.nodeid] in known:
+            further.add(item.nodeid)
+        known.add(own[item.nodeid])
+    return further
+
+
+@pytest.hookimpl(tryfirst=True)  # before xdist looks for groups
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """The longest files begin first, so that none runs alone after all others. Where time is
-    limited, the others are mixed, always alike: what is left out is then not all of one subject.
+    limited, every function's first case comes before further cases of any, and files are mixed,
+    always alike: what is left out is then no subject as a whole. The two parts of a file are groups
+    of their own (`--dist loadgroup`).
     """
-    mixed = config.getoption("--within") is not None
-    items.sort(key=lambda item: crc32(item.path.name.encode()) if mixed else 0)
-    items.sort(key=lambda item: item.path.stem not in LONG)
+    if config.getoption("--within") is not None:
+        further = further_cases(items)
+        for item in items:
+            group = f"{item.nodeid.partition('::')[0]} {int(item.nodeid in further)}"
+            item.add_marker(pytest.mark.xdist_group(group))
+        items.sort(key=lambda item: crc32(item.path.name.encode()))
+        items.sort(key=lambda item: (item.nodeid in further, item.path.stem not in LONG))
+    else:
+        items.sort(key=lambda item: item.path.stem not in LONG)
 
 
 def pytest_collection_finish() -> None:

@@ -16,10 +16,23 @@ MOST_CPU = 1.7
 """Limit of the CPU time, over that of loading the libraries alone: machines differ."""
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="CPU times are read from /proc")
-def test_the_first_answer_waits_for_nothing_it_does_not_need(finished, tmp_path):
-    said = tmp_path / "imports.txt"
-    command = [sys.executable, "-X", "importtime", "-m", "skyquilt", "view", str(finished.output),
+TRIES = 3
+"""Another process on the machine makes both take longer, but not alike: the least of so many."""
+
+
+def cpu_s_of_libraries():
+    before = os.times()
+    subprocess.run(
+        [sys.executable, "-X", "importtime", "-c", LIBRARIES], check=True, stderr=subprocess.DEVNULL
+    )
+    after = os.times()
+    used = after.children_user + after.children_system
+    return used - before.children_user - before.children_system
+
+
+def cpu_s_to_first_answer(output, said):
+    """Of the viewer of a run; what it loaded is in the file `said`."""
+    command = [sys.executable, "-X", "importtime", "-m", "skyquilt", "view", str(output),
                "--port", "0"]  # fmt: skip
     with said.open("w") as log:
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True)
@@ -31,15 +44,20 @@ def test_the_first_answer_waits_for_nothing_it_does_not_need(finished, tmp_path)
         finally:
             process.terminate()
             process.wait()
+    return sum(map(int, words[11:13])) / os.sysconf("SC_CLK_TCK")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="CPU times are read from /proc")
+def test_the_first_answer_waits_for_nothing_it_does_not_need(finished, tmp_path):
+    said = tmp_path / "imports.txt"
+    used = libraries = float("inf")
+    for _ in range(TRIES):
+        used = min(used, cpu_s_to_first_answer(finished.output, said))
+        libraries = min(libraries, cpu_s_of_libraries())
+        if used < MOST_CPU * libraries:
+            break
     loaded = [row.rsplit("|", 1)[1].strip() for row in said.read_text().splitlines() if "|" in row]
     assert "fastapi" in loaded  # the list is what it is taken for
     assert not [m for m in loaded if m.startswith(UNNEEDED)]
     assert len(loaded) < MOST_MODULES
-    before = os.times()
-    subprocess.run(
-        [sys.executable, "-X", "importtime", "-c", LIBRARIES], check=True, stderr=subprocess.DEVNULL
-    )
-    after = os.times()
-    least = after.children_user + after.children_system
-    least -= before.children_user + before.children_system
-    assert sum(map(int, words[11:13])) / os.sysconf("SC_CLK_TCK") < MOST_CPU * least
+    assert used < MOST_CPU * libraries
