@@ -171,7 +171,9 @@ def gradients(problem, state):
     return photos, normal.gc + priors.camera_gradient, normal.gv
 
 
-@pytest.mark.parametrize(("points", "offset"), [(60, False), (3000, True)])
+@pytest.mark.parametrize(
+    ("points", "offset"), [(60, False), pytest.param(3000, True, marks=pytest.mark.slow)]
+)
 def test_the_divided_system_is_the_dense_one(monkeypatch, points, offset):
     """Nested dissection gives the step and the covariance of one dense matrix; 3000 points: several
     parts.

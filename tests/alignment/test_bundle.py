@@ -603,8 +603,9 @@ def test_pictures_that_are_stretched_are_taken_as_they_are(aspect):
 
 @pytest.mark.parametrize(
     ("aspect", "by"),
-    [(0.75, "goes the same way"), (1.03, "deviations from 1")]
-    + [
+    [
+        (1.03, "deviations from 1"),
+        pytest.param(0.75, "goes the same way", marks=SLOW),
         pytest.param(1.33, "goes the same way", marks=SLOW),
         pytest.param(0.95, "deviations from 1", marks=SLOW),
     ],
@@ -618,6 +619,7 @@ def test_stretched_pictures_are_named_where_nothing_is_to_be_repaired(aspect, by
         assert said == pytest.approx(aspect, abs=0.01)
 
 
+@pytest.mark.slow
 def test_a_guessed_focal_length_far_from_the_true_one_is_guessed_again():
     """Without heights, which would tell it; begun once, it ends 85 % off."""
     flown = Flown()
@@ -644,6 +646,7 @@ def test_a_focal_length_that_files_tell_falsely_is_not_believed(times, plain):
     assert relative_error(flown, found) < 1.1 * relative_error(*plain)
 
 
+@pytest.mark.slow
 def test_a_camera_told_falsely_beside_one_that_is_not_told():
     """Both are found."""
     flown = Flown()
@@ -660,6 +663,7 @@ def test_a_camera_told_falsely_beside_one_that_is_not_told():
         assert camera.focal == pytest.approx(LENS[0], rel=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=SLOW) for k in (1, 2))])
 def test_photos_cropped_towards_a_corner_keep_their_lens(seed):
     """The axis meets them 150 px right and 110 px below the middle; two lines that were flown in

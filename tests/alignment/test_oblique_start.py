@@ -26,7 +26,7 @@ from skyquilt.matching.verify import Verify
 from skyquilt.model.camera import Camera
 from skyquilt.model.features import Features, Link, Matches
 from skyquilt.model.poses import MapFrame, Pose
-from tests.alignment.surveys import FOCAL, HEIGHT, WIDTH, photo, prior
+from tests.alignment.surveys import FOCAL, HEIGHT, WIDTH, alignment, photo, prior
 from tests.once import made_once
 
 FRAME = MapFrame(crs="EPSG:32630", origin=(500000.0, 5600000.0), vertical_datum="takeoff")
@@ -105,13 +105,22 @@ def grid(pitch):
     return [(x, y, 45.0, 0.0, pitch) for y in (-40, -22, -4) for x in (-36, -18, 0, 18, 36)]
 
 
+@pytest.fixture(scope="module")
+def round_about():
+    """An orbit and what is found of it."""
+    flown = Slanting(orbit(20, 50))
+    return flown, flown.aligned()
+
+
 SURVEYS = {"orbit": orbit(20, 50), "horizon": orbit(20, 45, pitch=66), "grid": grid(45)}
 
 
-@pytest.mark.parametrize("name", SURVEYS)
-def test_an_oblique_survey_is_placed(name):
+@pytest.mark.parametrize(
+    "name", ["orbit", *(pytest.param(n, marks=pytest.mark.slow) for n in ("horizon", "grid"))]
+)
+def test_an_oblique_survey_is_placed(name, round_about):
     flown = Slanting(SURVEYS[name])
-    found = flown.aligned()
+    found = round_about[1] if name == "orbit" else flown.aligned()
     assert len(found.poses) == len(flown.photos)
     away, turned = flown.errors(found)
     assert np.median(away) < 0.8
@@ -131,6 +140,7 @@ def by_hand(seed, count=22):
     return places
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [3, pytest.param(5, marks=pytest.mark.slow)])
 def test_photos_by_hand_are_placed_without_angles(seed):
     """Where links, taken for similarities of the ground's plane, put some of them elsewhere."""
@@ -226,12 +236,18 @@ def test_photos_without_angles_among_those_that_look_aslant_hang_on_them(pitch):
     assert max(away) < 3.5
 
 
-def test_photos_that_stay_turned_are_hung_on_the_others():
+@pytest.fixture(scope="module")
+def ahead():
+    """A flight that looks ahead by 15 degrees and what is found of it."""
+    flown = Slanting(there_and_back(15), alike_deg=180)
+    return flown, flown.aligned()
+
+
+def test_photos_that_stay_turned_are_hung_on_the_others(ahead):
     """Where neither links nor positions hold them, single ones end in false minima: 19 degrees and
     13 m aside, of a flight without positions.
     """
-    flown = Slanting(there_and_back(15), alike_deg=180)
-    found = flown.aligned()
+    flown, found = ahead
     aside = rotation_from_vector(np.array([0.2, 0.0, 0.0]))
 
     def turned(photos):
@@ -269,9 +285,8 @@ def test_photos_that_stay_turned_are_hung_on_the_others():
     ]
 
 
-def test_photos_without_positions_begin_where_they_were_found():
-    flown = Slanting(there_and_back(15), alike_deg=180)
-    found = flown.aligned()
+def test_photos_without_positions_begin_where_they_were_found(ahead):
+    flown, found = ahead
     nowhere = [replace(p, map_C=np.full(3, np.nan)) for p in flown.priors]
     assert oblique_start.aslant(nowhere)
     begin = oblique_start.beginnings(found, flown.photos, nowhere)
@@ -298,8 +313,8 @@ def swaying(seed, off=0.0, without=()):
     return flown
 
 
-@pytest.mark.parametrize("off", [12.0, 60.0])
-@pytest.mark.parametrize("seed", [2, pytest.param(4, marks=pytest.mark.slow), 5])
+@pytest.mark.parametrize("off", [60.0, pytest.param(12.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [2, *(pytest.param(s, marks=pytest.mark.slow) for s in (4, 5))])
 def test_a_compass_does_not_turn_photos_that_sway(seed, off):
     """Their tilts point elsewhere by as much as the compass is off, which held the map by it: it
     was turned by 2 to 15 degrees.
@@ -310,6 +325,7 @@ def test_a_compass_does_not_turn_photos_that_sway(seed, off):
     assert np.median(turned) < 1.7 and np.median(away) < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [5, pytest.param(2, marks=pytest.mark.slow)])
 def test_photos_that_sway_and_have_no_position_begin_beside_their_neighbours(seed, monkeypatch):
     begun = []
@@ -332,9 +348,8 @@ def test_photos_that_sway_and_have_no_position_begin_beside_their_neighbours(see
     assert len(apart) == 12 and np.abs(apart).max() < 15  # 60 before
 
 
-def test_an_adjustment_with_far_more_observations_is_the_better_one():
-    flown = Slanting(orbit(12, 50))
-    found = flown.aligned()
+def test_an_adjustment_with_far_more_observations_is_the_better_one(round_about):
+    flown, found = round_about
     ties = found.ties
     some = np.arange(len(ties.point)) % 3 > 0
     less = replace(
@@ -347,6 +362,7 @@ def test_an_adjustment_with_far_more_observations_is_the_better_one():
     assert not nearer(less, found, flown.priors) and not nearer(found, found, flown.priors)
 
 
+@pytest.mark.slow
 def test_photos_that_do_not_tell_their_pose_hang_on_the_others():
     flown = Slanting(orbit(20, 50), seed=2)
     flown.priors[7] = prior((np.nan,) * 3, pitch=50)
@@ -378,9 +394,9 @@ def untold_tilts(flown):
     return [replace(p, pitch_deg=0.0, roll_deg=0.0, sigma_tilt_deg=6.0) for p in flown.priors]
 
 
-def test_photos_that_an_adjustment_turned_are_taken_to_report_that():
-    flown = Slanting(orbit(20, 50))
-    found, level = flown.aligned(), untold_tilts(flown)
+def test_photos_that_an_adjustment_turned_are_taken_to_report_that(round_about):
+    flown, found = round_about
+    level = untold_tilts(flown)
     assert turned_priors(found, flown.priors) is None
     assert tilt_warnings(flown.priors, found) == []
     turned = turned_priors(found, level)
@@ -400,12 +416,12 @@ def test_photos_that_an_adjustment_turned_are_taken_to_report_that():
 
 def test_walls_around_what_photos_show_from_above_are_told():
     flown = Slanting([*orbit(20, 50), *grid(2)[:5]])
-    found = replace(flown.aligned(), poses=dict(enumerate(flown.truth)))
+    found = replace(alignment(25), poses=dict(enumerate(flown.truth)))
     (says,) = tilt_warnings(flown.priors, found)
     assert "20 of 25 photos look aslant" in says and "--max-view-angle 40" in says
     assert tilt_warnings(flown.priors, found, 40.0) == []
     round_about = Slanting(orbit(20, 50))
-    found = replace(found, poses=dict(enumerate(round_about.truth)))
+    found = replace(alignment(20), poses=dict(enumerate(round_about.truth)))
     assert tilt_warnings(round_about.priors, found) == []  # nothing is shown from above
 
 
@@ -509,7 +525,7 @@ def test_photos_that_look_down_whatever_they_report_are_found_by_the_pictures(to
 
 def test_what_looks_at_the_horizon_is_not_lowered():
     flown = Slanting(orbit(24, 40, pitch=72), seed=1)
-    found = replace(flown.aligned(), poses=dict(enumerate(flown.truth)))
+    found = replace(alignment(24), poses=dict(enumerate(flown.truth)))
     assert lowered(found, flown.priors) is flown.priors
 
 
@@ -550,6 +566,7 @@ def test_tilts_that_all_photos_have_in_common_are_found(pitch):
     assert tilt_warnings(flown.priors, found)
 
 
+@pytest.mark.slow
 def test_heights_that_drift_tilt_no_photo():
     """They are uneven as those of photos that look aslant are, and nearer to many a false tilt."""
     flown = Slanting([(x, y, 45.0, 0.0, 0.0) for y in (-36, -12, 12, 36) for x in (-27, -9, 9, 27)])

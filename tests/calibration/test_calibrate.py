@@ -98,7 +98,7 @@ def test_the_fit_is_the_minimum_that_scipy_finds(free):
 
 
 @pytest.mark.parametrize("marks", ["centres", "corners"])
-@pytest.mark.parametrize("count", [3, 6])
+@pytest.mark.parametrize("count", [3, pytest.param(6, marks=pytest.mark.slow)])
 def test_boards_that_are_not_tilted_give_a_camera_that_admits_it(marks, count):
     """Nothing tells the focal length from the distance."""
     rng = np.random.default_rng(0)
@@ -111,6 +111,7 @@ def test_boards_that_are_not_tilted_give_a_camera_that_admits_it(marks, count):
     assert found.sigma("focal") > 0.1 * found.camera.focal  # the command refuses it
 
 
+@pytest.mark.slow
 def test_small_coefficients_are_dropped_and_large_ones_stay():
     found = Calibrate()(views(count=15), BOARD)
     names = [n for n, _, _ in found.dropped]

@@ -122,6 +122,7 @@ def test_inliers_lie_where_the_transform_puts_them(auto):
     assert found.evidence["patches_agreeing"] == len(found.px_a) <= found.evidence["patches"]
 
 
+@pytest.mark.slow
 def test_a_good_guess_is_used_and_a_wrong_one_does_no_harm(auto):
     truth = turned(1.0, 95.0, SMALL, SMALL)
     a, b = pair(truth, SMALL, seed=10, shape_a=SMALL)
@@ -236,6 +237,7 @@ def trees(seed, jitter):
     return cv2.GaussianBlur(field, (0, 0), 1.0)
 
 
+@pytest.mark.slow
 def test_what_repeats_is_refused_and_found_where_trees_stand_off_their_rows(auto):
     """Two parts of a field: nothing tells the periods apart, so neither picture may be moved."""
     seed = 0

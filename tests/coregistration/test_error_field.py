@@ -220,6 +220,7 @@ def test_methods_without_a_stated_error_take_no_tolerance():
         RegisterSettings(method="surf", tolerance_px=5.0)
 
 
+@pytest.mark.slow
 def test_a_picture_that_is_blank_in_part_says_so():
     """The error is within the bound, and the bound larger than with the whole picture, and more so
     on the blank side.

@@ -80,7 +80,9 @@ def typed(b, kind):
     return stored, fill[kind], degrees * factor
 
 
-@pytest.mark.parametrize("kind", ["float64", "int16", "uint32"])
+@pytest.mark.parametrize(
+    "kind", ["int16", *(pytest.param(k, marks=pytest.mark.slow) for k in ("float64", "uint32"))]
+)
 def test_values_of_any_type_with_stated_fillings(scene, tmp_path, kind):
     """int16 and others ended in a traceback, and -9999 and -3.4e38 ran into what lies beside."""
     path, b = scene
@@ -104,7 +106,7 @@ def test_values_of_any_type_with_stated_fillings(scene, tmp_path, kind):
         assert (raster.read(1) == stored).all()
 
 
-@pytest.mark.parametrize("kind", ["float32", "int16"])
+@pytest.mark.parametrize("kind", ["float32", pytest.param("int16", marks=pytest.mark.slow)])
 def test_fillings_that_the_file_does_not_state(scene, tmp_path, kind):
     path, b = scene
     stored, _, meant = typed(b, kind)
@@ -152,7 +154,7 @@ def test_a_palette_is_read_as_its_colours(scene, tmp_path):
         assert raster.colormap(1)[int(order[9])] == (9, 246, 9, 255)
 
 
-@pytest.mark.parametrize("how", ["mask", "alpha"])
+@pytest.mark.parametrize("how", ["mask", pytest.param("alpha", marks=pytest.mark.slow)])
 def test_masks_reach_both_outputs(scene, tmp_path, how):
     path, b = scene
     colours, seen = np.stack([b, b // 2 + 60, 255 - b]), np.where(b > 0, 255, 0).astype(np.uint8)
@@ -181,7 +183,7 @@ def mirrored(values):
     return np.ascontiguousarray(values[::-1])
 
 
-@pytest.mark.parametrize("which", ["a", "b"])
+@pytest.mark.parametrize("which", ["a", pytest.param("b", marks=pytest.mark.slow)])
 def test_rows_from_south_to_north(scene, tmp_path, which):
     """A map whose first row is its most southern one had been compared in the mirror."""
     path, b = scene
@@ -231,7 +233,7 @@ def places_of(crs, place):
     return px, np.stack(~place @ (np.asarray(x), np.asarray(y)), 1) - 0.5
 
 
-@pytest.mark.parametrize("shift", [0.0, 0.02])
+@pytest.mark.parametrize("shift", [0.02, pytest.param(0.0, marks=pytest.mark.slow)])
 def test_degrees_of_equal_size_are_not_as_wide_as_high(tmp_path, shift):
     """What QGIS and gdalwarp write in EPSG:4326: at 45 degrees a pixel is 1.4 times as high as it
     is wide. Where the place was no guess, nothing was found.
@@ -255,6 +257,7 @@ def test_degrees_of_equal_size_are_not_as_wide_as_high(tmp_path, shift):
     assert np.abs(found[:, :2] / found[:, 2:] - there).max() < 0.6
 
 
+@pytest.mark.slow
 def test_maps_of_a_local_system_or_of_none(scene, tmp_path):
     """A local system beside one of the Earth ended in a traceback; one beside none is its own."""
     path, b = scene

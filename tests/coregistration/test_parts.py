@@ -126,7 +126,9 @@ def test_everywhere_has_the_truth_among_its_best(degrees):
     )
 
 
-@pytest.mark.parametrize("corner", [(0, 0), (256, 0), (256, 304)])
+@pytest.mark.parametrize(
+    "corner", [(256, 304), *(pytest.param(c, marks=pytest.mark.slow) for c in ((0, 0), (256, 0)))]
+)
 def test_a_part_is_found_in_every_corner_of_the_whole(corner):
     """An eighth of the area, in another spectrum; the whole must lie in the plane with its rim."""
     one, other = pair(np.eye(3), seed=6)

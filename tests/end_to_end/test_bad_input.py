@@ -115,7 +115,7 @@ def renamed_text(path: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "reason"),
     [
-        (truncated, "truncated"),
+        late(truncated, "truncated"),
         (garble, "damaged"),
         late(cut_but_ended, "damaged"),
         late(emptied, "0 bytes"),
@@ -540,6 +540,7 @@ def test_angles_missing(mosaic, photos):
     assert told.metrics["photos_used"] == 9
 
 
+@pytest.mark.slow
 def test_camera_aimed_at_the_horizon_by_pose(mosaic, photos):
     for path in named(photos):
         text = path.read_bytes()
@@ -584,6 +585,7 @@ def test_all_metadata_stripped(mosaic, photos):
     assert "not georeferenced" in told.out
 
 
+@pytest.mark.slow
 def test_all_metadata_stripped_but_control_points(mosaic, photos, flight):
     for path in named(photos):
         relabel(path, strip=True)

@@ -162,6 +162,7 @@ def test_bounds_that_cut_the_map(mosaic, flight, finished):
     assert told.metrics["size_px"] == pytest.approx([100, 100], abs=2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", [pytest.param(0.1, marks=pytest.mark.slow), 1.0])
 def test_bounds_of_some_pixels(mosaic, flight, finished, side):
     """Most photos show none of so small a map."""

@@ -310,6 +310,7 @@ def test_a_preview_gives_way_on_a_map_begun_again(flight, tmp_path, monkeypatch)
     live.close()
 
 
+@pytest.mark.slow
 def test_a_photo_without_position_waits_and_is_placed_by_its_links(flight, tmp_path):
     lost = tmp_path / "lost.jpg"
     shutil.copyfile(flight.photos[1], lost)

@@ -103,7 +103,7 @@ def hovering(flown, still, seed):
     return [*flown[:at], *shots, *flown[at:]]
 
 
-@pytest.mark.parametrize(("still", "seed"), [(8, 0), (16, 1)])
+@pytest.mark.parametrize(("still", "seed"), [(8, 0), pytest.param(16, 1, marks=pytest.mark.slow)])
 def test_a_hover_within_a_flight_shows_no_marks(still, seed):
     assert not marks_in(hovering(flight(8, seed=seed), still, seed))[1].masks
 

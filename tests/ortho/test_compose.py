@@ -398,6 +398,7 @@ def photographed(shot):
     return value.reshape(h, w, 1).astype(np.float32)
 
 
+@pytest.mark.slow
 def test_a_house_has_no_walls_in_the_map():
     """A photo that sees two walls: the map shows the roof up to its edges, the ground from there
     on, and no strip of wall between.

@@ -170,6 +170,7 @@ def strip(count=12):
     return views, {v.photo: heat(v) + np.float32(offset[v.photo]) + noise[v.photo] for v in views}
 
 
+@pytest.mark.slow
 def test_a_ring_common_to_all_frames_is_found():
     views, frames = strip()
     ringed = {k: f + RING for k, f in frames.items()}

@@ -185,6 +185,7 @@ def test_white_is_warm_in_thermal_photos_and_tells_no_overexposure():
     assert of_heat == ({}, ())
 
 
+@pytest.mark.slow
 def test_what_a_hover_shows_at_one_place_is_no_dust():
     """Twelve photos of one place beside twelve of a line: they alone show a dark car."""
     alignment = flight(12, apart=6.0)
@@ -202,6 +203,7 @@ def test_what_a_hover_shows_at_one_place_is_no_dust():
     assert shown(alignment, taken) == ({}, ())
 
 
+@pytest.mark.slow
 def test_what_photos_circle_around_is_no_dust():
     """Sixteen photos around a dark tower, whose top each shows before the ground beyond it."""
     alignment = flight(16, apart=6.0)

@@ -107,6 +107,7 @@ def test_a_box_stands_up(heights):
     assert 0.0 < np.median(np.abs(z[outside < -1] - BOX))  # found, not given
 
 
+@pytest.mark.slow
 def test_a_box_stands_up_seen_aslant():
     """A row of photos that look 55 degrees away from straight down, 45 m south of the box: pairs
     chosen by their height above ground, in pixels of straight views, gave a tenth of the roof 40 cm
@@ -414,6 +415,7 @@ def test_hidden_ground_is_filled_in_bands_as_at_once(monkeypatch):
     assert np.array_equal(lowered(*turned, 12, 1.0).T[::-1, ::-1], whole)
 
 
+@pytest.mark.slow
 def test_edges_are_sought_where_they_are_asked_for(flight, heights):
     """The walls of the box move closer to their place, and its roof and the ground stay."""
     views, grey = flight

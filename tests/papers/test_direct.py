@@ -47,7 +47,7 @@ def error(found, H):
     [
         (Ncc(), (130.3, -71.8), 0.1),
         (Ncc(), (-210.0, 40.5), 0.15),
-        (Ncc(turn=20, zoom=1.1), (60.2, 31.7, 0.3, 0.08), 0.3),
+        pytest.param(Ncc(turn=20, zoom=1.1), (60.2, 31.7, 0.3, 0.08), 0.3, marks=pytest.mark.slow),
         pytest.param(Ncc(turn=180), (-40.4, 12.0, 2.6), 0.3, marks=pytest.mark.slow),
         (PhaseCorrelation(), (90.3, -51.8), 0.15),
         (PhaseCorrelation(similarity=True), (20.3, -11.0, 0.5, 0.1), 1.5),
@@ -99,7 +99,7 @@ def test_mutual_information_where_correlation_fails():
         PhaseCorrelation(),
         PhaseCorrelation(similarity=True),
         Ecc(),
-        MutualInformation(similarity=False),
+        pytest.param(MutualInformation(similarity=False), marks=pytest.mark.slow),
     ],
 )
 def test_unrelated_and_blank_pictures_are_refused(method):

@@ -232,6 +232,7 @@ def test_full_pixels_and_blank_images(picture):
             Surf(**wrong)
 
 
+@pytest.mark.slow
 def test_no_slower_than_twice_opencvs_sift(picture):
     """CPU time at equal keypoints, the faster half of several runs of each, in turns."""
     large = np.clip(texture(750, 1000, seed=5), 0, 255).astype(np.uint8)

@@ -219,6 +219,7 @@ def test_drawings_hold_finite_numbers_only():
     assert not re.search(r'(?:d|x|y|width|height|transform)="[^"]*nan', build_report(run()))
 
 
+@pytest.mark.slow
 def test_two_thousand_photos_stay_small_and_quick():
     data = run(2000, observations=400_000, samples=20_000)
     start = time.process_time()

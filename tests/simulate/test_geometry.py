@@ -48,6 +48,7 @@ def hills_with_discs():
     return Scene(grid=grid, height=height, rgb=rgb, thermal=None), np.column_stack([discs, z])
 
 
+@pytest.mark.slow
 def test_discs_are_where_opencv_projects_them():
     scene, points = hills_with_discs()
     where = shot()

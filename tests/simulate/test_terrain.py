@@ -71,6 +71,7 @@ def test_a_window_has_the_heights_of_its_points(kind):
         assert heights[row, col] == pytest.approx(point, abs=0.03)
 
 
+@pytest.mark.slow
 def test_a_lake_is_level_and_nothing_stands_in_it():
     shore = country("shore")
     lake = shore.ground.heights(Grid(left=-100.0, top=50.0, res=1.0, width=60, height=100))
@@ -92,6 +93,7 @@ def test_a_town_has_tall_houses_and_bare_land_none():
     assert {parcel.kind for parcel in bare.parcels} == {"bare", "stubble"}
 
 
+@pytest.mark.slow
 def test_waves_move_from_photo_to_photo_and_the_shore_does_not(tmp_path):
     shore, weather = country("shore"), Weather()
     scene = empty_scene(shore.grid(0.25), thermal=False, scratch=tmp_path, water=WATER_M)

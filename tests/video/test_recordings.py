@@ -26,7 +26,7 @@ def frames_of(source, store):
     return result_of(with_frames(read_input(source, InputSettings()), InputSettings(), store))
 
 
-@pytest.mark.parametrize("fps", [24.0, 30000 / 1001, 60.0])
+@pytest.mark.parametrize("fps", [24.0, 30000 / 1001, pytest.param(60.0, marks=pytest.mark.slow)])
 def test_the_same_flight_at_any_frame_rate_gives_the_same_frames(tmp_path, fps):
     seconds = 7
     along = np.arange(round(seconds * fps)) / fps * SPEED
@@ -70,6 +70,7 @@ def test_a_recording_in_parts_is_one_flight(tmp_path, stated):
     assert len({p.camera_key for p in photos}) == 1
 
 
+@pytest.mark.slow
 def test_an_hour_of_hovering_gives_one_frame_and_costs_little(tmp_path):
     """Its wobble comes and goes; nothing new is seen."""
     rng, count = np.random.default_rng(1), 18_000
