@@ -62,7 +62,8 @@ def test_two_drones_a_yaw_lie_losses_and_disorder_make_one_coherent_map(drones, 
 
 @pytest.fixture(scope="module")
 def small(flight, tmp_path_factory):
-    live = mapped(tmp_path_factory.mktemp("live") / "out", flight.photos, deterministic=True)
+    folder = tmp_path_factory.mktemp("live") / "out"
+    live = mapped(folder, flight.photos, deterministic=True, features=500)
     yield live
     live.close()
 

@@ -25,8 +25,9 @@ from skyquilt.runs.opened import open_run
 @pytest.fixture(scope="module")
 def exported(finished, tmp_path_factory):
     folder = tmp_path_factory.mktemp("exports")
-    wanted = Wanted(what=WHAT)
-    return folder, list(export(finished.output, wanted, folder))
+    tiled = ("mbtiles", "tiles")  # coarser: there are enough of them
+    wanted = [Wanted(what=tuple(w for w in WHAT if w not in tiled)), Wanted(what=tiled, gsd_m=0.15)]
+    return folder, [done for w in wanted for done in export(finished.output, w, folder)]
 
 
 def middle(finished, share=0.5):
