@@ -444,6 +444,7 @@ def test_control_points_move_the_block_to_the_ground(offset):
     assert found.frame.vertical_datum == "control"
 
 
+@pytest.mark.slow
 def test_check_points_take_no_part():
     """A check point surveyed 5 m wrong is reported as such and changes nothing else."""
     flown = Flown(6)

@@ -162,6 +162,7 @@ def test_a_photo_that_cannot_be_read_any_more_when_the_map_is_drawn(mosaic, phot
     assert "Input/output error" in told.metrics["photos_rejected"]["SIM_0005.jpg"]
 
 
+@pytest.mark.slow
 def test_png_tiff_and_a_torn_clip_among_jpegs(mosaic, photos):
     first, second, *_ = keep(photos, 0, 1, 2, 3)
     block = taken_apart(first.read_bytes())[0]

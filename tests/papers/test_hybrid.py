@@ -126,7 +126,11 @@ def run(flight, **more):
     )
 
 
-@pytest.mark.parametrize("optimise", OPTIMISERS, ids=("anneal", "surfaces"))
+@pytest.mark.parametrize(
+    "optimise",
+    [pytest.param(OPTIMISERS[0], marks=pytest.mark.slow), OPTIMISERS[1]],
+    ids=("anneal", "surfaces"),
+)
 def test_a_noisy_strip_becomes_a_strip(optimise):
     flight = fly(line(8, step=20.0, heading=60.0), yaw=60.0, gps=1.5, yaw_error=2.0, seed=3)
     found = run(flight, optimise=optimise)

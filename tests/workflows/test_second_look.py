@@ -77,6 +77,7 @@ def not_at_all(found, links, *given):
     return found, links
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("looks", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_photos_with_few_features_are_connected(small_flight, tmp_path, monkeypatch, looks):
     """Thirty features of a photo are too few to link all nine; a hundred and fifty are not."""
