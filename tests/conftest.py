@@ -92,6 +92,26 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 LONG = ("test_large_survey", "test_windows", "test_docs")
 """Files of tests that take a minute and more."""
+DEAR = (
+    "calibration/test_few_views.py",
+    "end_to_end/test_thermal_simulated.py",
+    "live/test_crash.py",
+    "live/test_elsewhere.py",
+    "live/test_finish.py",
+    "live/test_heights.py",
+    "live/test_lenses.py",
+    "live/test_marks.py",
+    "live/test_placeless.py",
+    "thermal/test_thermal_rig.py",
+    "workflows/test_cluster.py",
+)
+"""Files of tests that take half a minute each: where time is limited, ten others come first."""
+
+
+def turn(path: Path) -> int:
+    """0 for the longest files, 2 for dear ones, 1 for all others."""
+    dear = f"{path.parent.name}/{path.name}" in DEAR
+    return 0 if path.stem in LONG else 1 + dear
 
 
 def further_cases(items: list[pytest.Item]) -> set[str]:
@@ -113,9 +133,9 @@ def further_cases(items: list[pytest.Item]) -> set[str]:
 @pytest.hookimpl(tryfirst=True)  # before xdist looks for groups
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """The longest files begin first, so that none runs alone after all others. Where time is
-    limited, every function's first case comes before further cases of any, and files are mixed,
-    always alike: what is left out is then no subject as a whole. The two parts of a file are groups
-    of their own (`--dist loadgroup`).
+    limited, every function's first case comes before further cases of any, what is dear comes last
+    of both, and files are mixed, always alike: what is left out is then no subject as a whole. The
+    two parts of a file are groups of their own (`--dist loadgroup`).
     """
     if config.getoption("--within") is not None:
         further = further_cases(items)
@@ -123,7 +143,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             group = f"{item.nodeid.partition('::')[0]} {int(item.nodeid in further)}"
             item.add_marker(pytest.mark.xdist_group(group))
         items.sort(key=lambda item: crc32(item.path.name.encode()))
-        items.sort(key=lambda item: (item.nodeid in further, item.path.stem not in LONG))
+        items.sort(key=lambda item: (item.nodeid in further, turn(item.path)))
     else:
         items.sort(key=lambda item: item.path.stem not in LONG)
 

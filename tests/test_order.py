@@ -1,8 +1,9 @@
 """Which slow tests come first where time is limited."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
-from tests.conftest import further_cases
+from tests.conftest import DEAR, LONG, further_cases, turn
 
 
 def item(nodeid, *marks):
@@ -26,3 +27,11 @@ def test_first_cases_are_those_that_nothing_else_shows():
         "a.py::test_sizes[larger]",
         "b.py::test_late[1]",
     }
+
+
+def test_dear_and_long_files_are_there():
+    tests = Path(__file__).parent
+    assert all(turn(tests / name) == 2 and (tests / name).is_file() for name in DEAR)
+    assert all(turn(path) == 0 for name in LONG for path in tests.rglob(f"{name}.py"))
+    assert len(LONG) == sum(1 for name in LONG for _ in tests.rglob(f"{name}.py"))
+    assert turn(tests / "alignment" / "test_heights.py") == 1
