@@ -70,6 +70,7 @@ def grown(flown, former):
     return added(inputs(flown, former), METHOD)
 
 
+@pytest.mark.slow
 def test_new_photos_lie_where_a_new_adjustment_would_put_them(flown, former, grown):
     whole = METHOD(flown.photos, FRAME, flown.priors, flown.features, flown.links)
     assert sorted(grown.poses) == sorted(whole.poses) == list(range(56))
@@ -112,6 +113,7 @@ def test_a_new_photo_says_how_well_it_is_known(former, grown):
         assert (grown.poses[i].sigma_m < 4 * known).all()
 
 
+@pytest.mark.slow
 def test_the_accuracy_is_told_alike_of_all_parts(flown, grown):
     """Of the part that was adjusted, no more places than of as much ground elsewhere."""
     whole = METHOD(flown.photos, FRAME, flown.priors, flown.features, flown.links)

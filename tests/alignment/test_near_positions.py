@@ -58,7 +58,11 @@ def off(survey, found):
     return abs(high / true - 1), abs(float(np.median(yaws)))
 
 
-@pytest.mark.parametrize("places", [ROW, SQUARE, HOVER], ids=["row", "square", "hover"])
+@pytest.mark.parametrize(
+    "places",
+    [*(pytest.param(p, marks=pytest.mark.slow) for p in (ROW, SQUARE)), HOVER],
+    ids=["row", "square", "hover"],
+)
 def test_few_photos_are_as_large_as_their_heights_tell(places, monkeypatch):
     surveys = [flown(places, seed) for seed in (1, 3)]
     told = [off(s, adjusted(s)) for s in surveys]

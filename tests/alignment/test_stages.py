@@ -30,7 +30,7 @@ def stepped(problem, state):
     return *stages.rough(problem, state, Keep(held=held)), len(names)
 
 
-@pytest.mark.parametrize("cameras", [1, 2])
+@pytest.mark.parametrize("cameras", [1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_some_photos_of_a_large_survey_tell_its_lens_first(monkeypatch, seed, cameras):
     """The whole ends where it ends without them, in fewer steps."""

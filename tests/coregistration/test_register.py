@@ -182,6 +182,7 @@ def dji_jpeg(path, counts, cut=0):
     path.write_bytes(data)
 
 
+@pytest.mark.slow
 def test_radiometric_photos_are_registered_by_their_counts(tmp_path):
     truth = turned(1.0, 30.0, (512, 640), (512, 640))
     labels = layout(512, 640, seed=3)

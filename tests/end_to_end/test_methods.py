@@ -38,7 +38,7 @@ def solved(told):
     return {s["properties"]["filename"]: np.array(s["properties"]["translation"]) for s in shots}
 
 
-LONG = ("hybrid", "flightline")
+LONG = ("hybrid", "flightline", "image", "position")
 
 
 @pytest.mark.parametrize(
@@ -138,6 +138,7 @@ def test_where_photos_do_not_overlap_a_new_piece_begins_and_is_said(mosaic, phot
     assert sum(told.metrics["blocks"]) == len(rest)
 
 
+@pytest.mark.slow
 def test_strangers_begin_a_piece_of_their_own(mosaic, photos, lines):
     """Two flights in one folder, one after the other: the sequence breaks between them."""
     import shutil

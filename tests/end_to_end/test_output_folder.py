@@ -175,7 +175,7 @@ def test_a_full_disk(mosaic, flight, small_disk, finished, size):
 
 
 @pytest.mark.parametrize(
-    "stage", ["alignment", *map(late, ("features", "links", "surface", "blocks"))]
+    "stage", [*map(late, ("alignment", "features", "links", "surface", "blocks"))]
 )
 def test_a_disk_that_fills_up_while_intermediate_results_are_stored(
     mosaic, flight, finished, monkeypatch, stage
@@ -445,7 +445,7 @@ def with_options(moment: tuple[str, str, int], request: pytest.FixtureRequest) -
 
 
 @pytest.mark.parametrize(
-    "moment", [MOMENTS[1], *map(late, MOMENTS[3::2]), *map(last, MOMENTS[::2])]
+    "moment", [late(MOMENTS[1]), *map(late, MOMENTS[3::2]), *map(last, MOMENTS[::2])]
 )
 def test_ctrl_c_ends_soon_and_the_same_command_resumes(mosaic, flight, tmp_path, request, moment):
     options, undisturbed = with_options(moment, request)

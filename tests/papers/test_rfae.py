@@ -86,7 +86,9 @@ def test_a_picture_without_edges_has_none():
     assert not binary_edges(gradient_magnitude(np.full((20, 20), 7, np.uint8)), 0.2).any()
 
 
-@pytest.mark.parametrize("method", ["usurf", "surf+rfae", "structure"])
+@pytest.mark.parametrize(
+    "method", ["usurf", pytest.param("surf+rfae", marks=pytest.mark.slow), "structure"]
+)
 def test_methods_register_what_they_are_made_for(method, alike):
     a, b, truth = alike
     found = registration_method(method)(Picture(values=a), Picture(values=b))

@@ -58,6 +58,7 @@ def project(truth, photo, points):
     )
 
 
+@pytest.mark.slow
 def test_same_seed_same_bytes(survey, tmp_path):
     list(simulate(settings(), tmp_path / "again"))
     files = [path.relative_to(survey) for path in sorted(survey.rglob("*")) if path.is_file()]
