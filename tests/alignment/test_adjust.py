@@ -469,7 +469,7 @@ def test_a_strip_stays_straight_by_its_tilt_priors_and_bends_without():
 # leave one out
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_leaving_one_out_is_what_re_solving_gives(seed):
     """The identity on the covariance against six solutions, each without one photo's position."""
     block = make_block(40 + seed, lines=2, per_line=3, points=120)

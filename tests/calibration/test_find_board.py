@@ -57,7 +57,13 @@ def test_a_board_that_is_smaller_than_said_is_refused():
     assert "squares were found" in view.reason
 
 
-@pytest.mark.parametrize("shift", [(-0.55, 0, 1.5), (0.5, 0.1, 1.4), (0, 0.45, 1.5)])
+@pytest.mark.parametrize(
+    "shift",
+    [
+        (-0.55, 0, 1.5),
+        *(pytest.param(v, marks=pytest.mark.slow) for v in ((0.5, 0.1, 1.4), (0, 0.45, 1.5))),
+    ],
+)
 def test_a_board_half_outside_the_frame_is_refused(shift):
     view = FindBoard()("", frame(frontal(shift=shift)), BOARD)
     assert not view

@@ -180,7 +180,7 @@ def test_the_product_is_that_of_the_dense_matrix(border):
     assert m.times()(x) == pytest.approx(dense_matrix(m) @ x, rel=1e-12)
 
 
-@pytest.mark.parametrize("heading", [20, 45])
+@pytest.mark.parametrize("heading", [20, pytest.param(45, marks=pytest.mark.slow)])
 def test_lines_of_any_heading_are_divided_as_well(heading):
     """The work of factoring a survey does not depend on the direction of its flight lines."""
     places, pairs = grid(40, 40, 2)

@@ -54,7 +54,10 @@ def test_a_text_is_found_and_nothing_beside_it():
     assert len(marks.notes) == 1
 
 
-@pytest.mark.parametrize("rows", [(30, 58, 86, 350), (30, 58, 86, 270, 300, 330, 350)])
+@pytest.mark.parametrize(
+    "rows",
+    [(30, 58, 86, 270, 300, 330, 350), pytest.param((30, 58, 86, 350), marks=pytest.mark.slow)],
+)
 def test_many_lines_of_text_are_no_camera_that_stands_still(rows):
     def lines(picture):
         for y in rows:
@@ -74,7 +77,9 @@ def test_texts_that_change_in_part_are_found_where_they_do_not():
     assert marks.on_mark("cam", np.array([[30.0, 252.0]])).all()
 
 
-@pytest.mark.parametrize("step", [20, 90, 400])
+@pytest.mark.parametrize(
+    "step", [20, *(pytest.param(v, marks=pytest.mark.slow) for v in (90, 400))]
+)
 def test_ground_is_no_mark(step):
     _, marks = marks_in(flight(8, step))
     assert not marks.masks and not marks.notes

@@ -189,7 +189,9 @@ def test_the_map_loses_its_patches(lit):
     assert before > 5 and after < 0.12 * before
 
 
-@pytest.mark.parametrize("bits", [10, 12, 14, 16])
+@pytest.mark.parametrize(
+    "bits", [10, 16, *(pytest.param(v, marks=pytest.mark.slow) for v in (12, 14))]
+)
 def test_photos_of_more_bits_are_balanced_as_those_of_eight(lit, bits):
     """The same pictures with more bits get the same gains and the same map, but for rounding; the
     lightest values tell how many of the 16 bits are used.

@@ -41,7 +41,7 @@ def frames(palettes, seed=1, *, own_range=True):
 
 @pytest.mark.parametrize("own_range", [True, False])
 @pytest.mark.parametrize("name", MAPS)
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_one_palette_is_one(name, own_range, seed):
     small = frames([name] * 12, seed, own_range=own_range)
     assert palette_notes([photo()] * 12, small) == ()

@@ -293,7 +293,7 @@ def test_edges_run_straight_through_the_staircase_of_cells(turn_deg):
         assert off[0] < 0.75 * off[1] and wrong.mean() < 0.7 * stairs.mean()
 
 
-@pytest.mark.parametrize("along", [0, 1])
+@pytest.mark.parametrize("along", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_the_heights_of_a_long_corridor_stay_within_what_opencv_takes(along):
     """30 km of railway, points every half metre."""
     rng = np.random.default_rng(4)

@@ -67,7 +67,7 @@ def test_drones_fly_at_once():
     assert np.all(np.diff([p.time for p in points]) >= 0)
 
 
-@pytest.mark.parametrize("correlation", [0.0, 60.0])
+@pytest.mark.parametrize("correlation", [60.0, pytest.param(0.0, marks=pytest.mark.slow)])
 def test_position_noise(correlation):
     flown = shots(Route(photos=900))
     place = place_at(46.6, 14.3)
