@@ -456,6 +456,7 @@ def tilt_deg(state):
     return np.degrees(np.arccos(np.clip(-state.R[:, 2, 2], -1, 1)))
 
 
+@pytest.mark.slow
 def test_a_strip_stays_straight_by_its_tilt_priors_and_bends_without():
     block, problem = strip(0)
     start = replace(block.start, R=block.truth.R, K=problem.K0)

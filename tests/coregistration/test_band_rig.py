@@ -59,7 +59,7 @@ def test_bands_lie_on_each_other():
     assert found.share > 0.9 and found.off_px < 0.25
 
 
-@pytest.mark.parametrize("delay_s", [0.0, 0.2])
+@pytest.mark.parametrize("delay_s", [pytest.param(0.0, marks=pytest.mark.slow), 0.2])
 def test_a_band_that_is_exposed_later_is_told_from_a_turned_one(delay_s):
     """The camera keeps its heading: on lines flown back the delay is to the other side, 8 px of
     ground at 60 m.

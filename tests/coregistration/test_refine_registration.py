@@ -61,6 +61,7 @@ def test_colours_find_the_place_that_shading_hides(seed, sky):
     assert found.evidence["surprise"] == 9.0  # what it was believed for stays
 
 
+@pytest.mark.slow
 def test_colours_that_confirm_nothing_leave_it_to_brightness():
     """Colour noise of a JPEG on a grey picture, and colours of another place."""
     a, b = rough_ground(3, TRUTH)
@@ -99,6 +100,7 @@ def test_what_runs_away_is_left_where_it_was_believed():
     assert np.array_equal(blank.b_H_a, wrong)
 
 
+@pytest.mark.slow
 def test_freedom_is_taken_where_it_pays_only():
     sheared = np.array([[1, 0.02, -5.0], [0, 1, 0], [0, 0, 1.0]]) @ TRUTH
     settle = RefineRegistration(free=SubpixelRefinement(freedom="affine", steps=12), reach=0.03)

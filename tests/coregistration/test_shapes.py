@@ -44,6 +44,7 @@ def test_another_area_is_described_differently():
     assert np.linalg.norm(disc[4:] - upright[4:]) > 0.3
 
 
+@pytest.mark.slow
 def test_pictures_of_two_spectra_are_brought_together():
     truth = turned(0.9, 130.0, SHAPE, SHAPE, (5.0, -8.0))
     a, b = pair(truth, seed=16)

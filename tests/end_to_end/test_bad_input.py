@@ -558,6 +558,7 @@ def test_camera_aimed_at_the_horizon_by_pose(mosaic, photos):
     assert low < max(width, height) < 2 * reach + 150  # the centres lie within 150 m
 
 
+@pytest.mark.slow
 def test_photos_that_show_no_ground_within_the_largest_angle_have_a_reason(mosaic, photos):
     level = named(photos)[3:5]
     for path in level:

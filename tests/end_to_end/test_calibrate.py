@@ -40,6 +40,7 @@ def done(frames, tmp_path_factory):
     return calibrate(frames, out, SETTINGS)
 
 
+@pytest.mark.slow
 def test_all_files_are_there_and_mosaic_can_read_the_camera(done):
     assert sorted(p.name for p in done.output.iterdir()) == sorted(CONTRACT)
     (camera,) = read_cameras_json(done.output / "cameras.json").values()
@@ -49,6 +50,7 @@ def test_all_files_are_there_and_mosaic_can_read_the_camera(done):
     assert json.loads((done.output / "calibration.json").read_text())["views_used"] == 5
 
 
+@pytest.mark.slow
 def test_a_frame_without_a_board_is_named(done):
     assert list(done.metrics["views_rejected"]) == ["wall.tif"]
     assert "blank" in done.metrics["views_rejected"]["wall.tif"]
@@ -57,11 +59,13 @@ def test_a_frame_without_a_board_is_named(done):
     assert not re.search(r"(src|href)=\"(?!data:|#)", page)
 
 
+@pytest.mark.slow
 def test_undistortion_makes_registration_better(done):
     figures = done.metrics["registration"]
     assert figures["mse_undistorted_px2"] < 0.5 * figures["mse_raw_px2"]
 
 
+@pytest.mark.slow
 def test_a_taken_folder_is_left_alone(done, frames):
     with pytest.raises(OutputError, match="--overwrite"):
         calibrate(frames, done.output, SETTINGS)

@@ -134,6 +134,7 @@ def test_without_positions_the_map_begins_with_four_and_tells_no_place(flight, t
         assert not (site.folder / "map.mbtiles").exists()
 
 
+@pytest.mark.slow
 def test_headings_are_told_to_be_those_that_photos_report(flight, tmp_path):
     photos = placeless(flight.photos[:4], tmp_path / "in")
     for path in photos:

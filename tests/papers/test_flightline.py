@@ -86,6 +86,7 @@ def test_what_it_cannot_do_is_refused_with_a_sentence():
         run(flight)
 
 
+@pytest.mark.slow
 def test_a_photo_without_position_is_left_out_and_said_so():
     flight = fly(lawn(3, 5, step=20.0, apart=30.0), points=6000)
     flight.priors[7] = replace(flight.priors[7], map_C=np.array([np.nan, np.nan, 60.0]))
@@ -93,6 +94,7 @@ def test_a_photo_without_position_is_left_out_and_said_so():
     assert "no position" in found.rejected[7] and len(found.poses) == 14
 
 
+@pytest.mark.slow
 def test_a_line_that_nothing_links_is_left_out_by_name():
     xy = np.concatenate([lawn(2, 5, step=20.0, apart=30.0), line(5, 20.0, start=(400.0, 0.0))])
     flight = fly(xy, points=9000)

@@ -151,6 +151,7 @@ def test_earlier_photos_stay():
     assert np.array_equal(more.poses[0].map_C, placed(flight).poses[0].map_C)
 
 
+@pytest.mark.slow
 def test_the_loop_closes_without_any_global_optimisation():
     around = np.concatenate(
         [

@@ -54,6 +54,7 @@ def bench(listed, tmp_path_factory):
     return output, events
 
 
+@pytest.mark.slow
 def test_rows_are_held_against_the_truth(bench):
     output, _ = bench
     rows = json.loads((output / "bench.json").read_text())["pairs"]
@@ -89,6 +90,7 @@ def test_rows_are_held_against_the_truth(bench):
     assert all(r["seconds"] > 0 for r in rows)
 
 
+@pytest.mark.slow
 def test_tables_count(bench):
     output, events = bench
     page = (output / "report.html").read_text()

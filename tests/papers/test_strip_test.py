@@ -61,6 +61,7 @@ def test_the_page_is_whole(finished):
     assert page.count('<path style="fill:none') == 18
 
 
+@pytest.mark.slow
 def test_a_perfect_camera_over_level_boards_keeps_the_shape(tmp_path):
     """Without noise, tilt and things, the right lens model ends at 1 but for the calibration's own
     error.
@@ -71,6 +72,7 @@ def test_a_perfect_camera_over_level_boards_keeps_the_shape(tmp_path):
     assert min(etas[4:6]) > 0.995 and etas[0] < 0.9
 
 
+@pytest.mark.slow
 def test_equal_seeds_give_equal_results(tmp_path):
     settings = StripSettings(photos=3, seed=7, views=10)
     found = [
