@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module", params=[120, pytest.param(300, marks=pytest.mark.long)])
+@pytest.fixture(scope="module", params=[180, pytest.param(300, marks=pytest.mark.long)])
 def flight(tmp_path_factory, request):
     """Photos of 0.17 MP by three drones over ground without houses that stand (see the program)."""
     folder = tmp_path_factory.mktemp("flight")
