@@ -301,7 +301,7 @@ def with_fisheyes(
         matches = _on_ground(matcher(*two), marked)
         return two[0].px[matches.index_a], two[1].px[matches.index_b]
 
-    straight = Straightened(found.photos, grey, methods.detector, store)
+    straight = Straightened(photos=found.photos, grey=grey, detector=methods.detector, store=store)
 
     def shared(a: int, b: int, lens: Camera) -> int:
         two = straight(a, lens), straight(b, lens)

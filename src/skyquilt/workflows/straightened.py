@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from numpy.typing import NDArray
@@ -29,16 +29,24 @@ class _Straight:
         return sys.getsizeof(self.features)
 
 
+@dataclass(kw_only=True, eq=False)
 class Straightened:
     """Features found in grey images that are straightened (`matching.straightened`), from the
     store.
     """
 
-    def __init__(
-        self, photos: Sequence[Photo], grey: GreyPictures, detector: Detector, store: Store
-    ) -> None:
-        self._photos, self._grey, self._detector, self._store = photos, grey, detector, store
-        self._lenses: dict[int, Camera] = {}
+    photos: Sequence[Photo]
+    """The photos of a survey."""
+    grey: GreyPictures
+    """Their grey images."""
+    detector: Detector
+    """Finds features."""
+    store: Store
+    """Keeps them."""
+    _lenses: dict[int, Camera] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Those used last are kept in memory."""
         self._kept = PixelCache(read=self._found, budget_bytes=KEPT_BYTES)
 
     def __call__(self, photo: int, lens: Camera) -> Features:
@@ -49,16 +57,16 @@ class Straightened:
         return self._kept(photo).features
 
     def _found(self, photo: int) -> _Straight:
-        own, lens = self._photos[photo], self._lenses[photo]
+        own, lens = self.photos[photo], self._lenses[photo]
 
         def found() -> Features:
             def of(pixels: NDArray[Any]) -> Features:
-                return self._detector.of_shrunken(pixels, pixels.shape[:2])
+                return self.detector.of_shrunken(pixels, pixels.shape[:2])
 
-            longest, full = self._detector.longest, (own.height, own.width)
-            return straightened_features(lens, self._grey(photo, PICTURE), full, longest, of)
+            longest, full = self.detector.longest, (own.height, own.width)
+            return straightened_features(lens, self.grey(photo, PICTURE), full, longest, of)
 
-        recipe = features_recipe(self._detector)
+        recipe = features_recipe(self.detector)
         return _Straight(
-            self._store.get_or("features", digest(own.pixels_key, "straight", lens, recipe), found)
+            self.store.get_or("features", digest(own.pixels_key, "straight", lens, recipe), found)
         )
