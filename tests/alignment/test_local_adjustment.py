@@ -24,9 +24,14 @@ AROUND = [
 def window(pitch_deg, sigma_tilt_deg=1.0, seed=1):
     flown = Slanting([*AROUND, (-2.0, -1.0, 50.0, 80.0, pitch_deg)], seed=seed, alike_deg=180)
     new = len(AROUND)
-    key = flown.photos[0].camera_key
     flown.priors[new] = replace(flown.priors[new], sigma_tilt_deg=sigma_tilt_deg)
-    return flown, Window(
+    return flown, window_on(flown, held=range(new))
+
+
+def window_on(flown, held):
+    """The last photo joins the others, which stand where they were taken."""
+    key, new = flown.photos[0].camera_key, len(flown.photos) - 1
+    return Window(
         photos=flown.photos,
         priors=flown.priors,
         features=flown.features,
@@ -35,7 +40,7 @@ def window(pitch_deg, sigma_tilt_deg=1.0, seed=1):
         cameras={key: CAMERA},
         camera_of=dict.fromkeys(range(new), key),
         new=new,
-        held=frozenset(range(new)),
+        held=frozenset(held),
         ground=0.0,
         sigma_xy=0.0,
     )
@@ -78,3 +83,15 @@ def test_a_link_with_another_place_is_dropped():
     assert off(flown, done, new)[0] < 0.3
     alone = LocalAdjustment()(replace(asked, links=[]))
     assert isinstance(alone, NotAdjusted)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_positions_that_are_far_off_bend_nothing(seed):
+    """A line goes on while its receiver is off by 300 m: its end was drawn aside photo by photo."""
+    line = [(0.0, 22.0 * k, 50.0, 0.0, 0.0) for k in range(-2, 4)]
+    flown = Slanting(line, seed=seed)
+    for k in (3, 4, 5):
+        flown.priors[k] = replace(flown.priors[k], map_C=flown.priors[k].map_C + [240, -180, 0])
+    asked = window_on(flown, held={0, 1, 2})
+    away, turned = off(flown, LocalAdjustment()(asked), asked.new)
+    assert away < 1.0 and turned < 0.5

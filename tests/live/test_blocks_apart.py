@@ -46,6 +46,20 @@ def line(tmp_path_factory):
     )
 
 
+def _displace(monkeypatch, displaced, east_deg):
+    """Positions of these photos are off by as much."""
+    read = members.read_photo
+
+    def elsewhere(path, *, name, **more):
+        photo = read(path, name=name, **more)
+        if name not in displaced:
+            return photo
+        there = replace(photo.position, longitude_deg=photo.position.longitude_deg + east_deg)
+        return replace(photo, position=there)
+
+    monkeypatch.setattr(members, "read_photo", elsewhere)
+
+
 @pytest.mark.long
 @pytest.mark.slow
 def test_blocks_that_lie_apart_become_one_where_they_meet(line, tmp_path, monkeypatch):
@@ -53,16 +67,7 @@ def test_blocks_that_lie_apart_become_one_where_they_meet(line, tmp_path, monkey
     others, and were dropped: the map stayed torn.
     """
     names = [p.name for p in line.photos]
-    displaced, read = set(names[-6:]), members.read_photo
-
-    def elsewhere(path, *, name, **more):
-        photo = read(path, name=name, **more)
-        if name not in displaced:
-            return photo
-        there = replace(photo.position, longitude_deg=photo.position.longitude_deg + EAST_DEG)
-        return replace(photo, position=there)
-
-    monkeypatch.setattr(members, "read_photo", elsewhere)
+    _displace(monkeypatch, set(names[-6:]), EAST_DEG)
     live = LiveMap(tmp_path / "out", LiveSettings(features=600))
     fed(live, [*line.photos[:6], *line.photos[-6:]])
     assert len(live.members.block(1)) == 6
@@ -93,4 +98,23 @@ def test_photos_of_other_blocks_are_compared_when_no_photos_arrive(flight, tmp_p
     for _ in live.drain_all():
         pass
     assert len(live.members.block(1)) == 6
+    live.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [(0, 1, 2, 3, 4, 5), (0, 4, 1, 5, 2, 3)])
+def test_photos_whose_positions_are_far_off_are_found(flight, order, tmp_path, monkeypatch):
+    """A receiver jumped by 500 m: nothing is near there, and photos were compared with none."""
+    names = [p.name for p in flight.photos]
+    _displace(monkeypatch, set(names[2:4]), 20 * EAST_DEG)
+    live = fed(
+        LiveMap(tmp_path / "out", LiveSettings(features=600)), [flight.photos[k] for k in order]
+    )
+    assert len(live.members.block(1)) == len(names)
+    off = np.array([
+        (m.pose.map_C[:2] + live.members.frame.origin) - flight.centre(m.photo.name)[:2]
+        for m in live.members.on_map()
+    ])  # fmt: skip
+    assert len(off) == len(names)
+    assert np.linalg.norm(off, axis=1).max() < 25.0
     live.close()

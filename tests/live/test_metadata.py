@@ -3,6 +3,8 @@
 import json
 import re
 import shutil
+from dataclasses import replace
+from datetime import timedelta
 
 import numpy as np
 import piexif
@@ -210,6 +212,26 @@ def test_what_metadata_are_worth_tells_whether_photos_are_drawn_by_them(
     live.members.by_id[1].tried = 0  # then there is nothing to be linked with
     live.members.by_id[2].tried = 0
     assert not metadata.loose(member, pose)
+    live.close()
+
+
+def test_a_receiver_that_drifts_is_followed(flight, tmp_path):
+    """Photos after it are placed as those beside it err, a late one as those of its time did."""
+    live = LiveMap(tmp_path / "out", SETTINGS)
+    metadata = live.initial_pose.metadata
+    for path in flight.photos[:2]:
+        live.add(path)
+    last = live.members.by_id[2]
+    before, began = metadata.first(last).map_C, last.photo.time
+    for k in range(10):  # refined in another order than they were taken
+        taken = began + timedelta(seconds=4 * (3 * k % 10) - 50)
+        drift = np.array([0.5 * (3 * k % 10), 8.0, 0.0])
+        pose = replace(last.pose, map_C=last.prior.map_C + drift)
+        photo = replace(last.photo, time=taken)
+        metadata.learn(replace(last, id=100 + k, photo=photo, pose=pose))
+    assert (metadata.first(last).map_C - before)[:2] == pytest.approx([4.5, 8.0], abs=0.5)
+    late = replace(last, photo=replace(last.photo, time=began - timedelta(seconds=45)))
+    assert (metadata.first(late).map_C - before)[:2] == pytest.approx([0.5, 8.0], abs=0.5)
     live.close()
 
 

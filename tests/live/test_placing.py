@@ -73,6 +73,16 @@ def test_a_photo_that_tells_no_tilt_is_compared_with_those_beside_it_in_time(liv
     assert neighbours.of(known[4], far) == []
 
 
+def test_photos_taken_next_to_one_are_those_of_other_blocks(live, monkeypatch):
+    neighbours, known = live.refinement.local_pose.neighbours, live.members.by_id
+    assert [neighbours.taken_next(m) for m in known.values()] == [[], [], [], []]
+    monkeypatch.setattr(live.ledger, "compared", lambda *pair: sorted(pair) == [3, 4])
+    monkeypatch.setattr(live.members, "block", lambda i: {1, 2} if i < 3 else {3, 4})
+    assert [neighbours.taken_next(m) for m in known.values()] == [[], [3], [2], []]
+    monkeypatch.setattr(known[3], "state", "superseded")
+    assert neighbours.taken_next(known[2]) == [4]
+
+
 def test_heights_that_some_photos_alone_tell_correct_no_others(live, monkeypatch):
     """The height of a photo that tells none is no error of reported heights, and the other way
     round: photos were placed at the take-off's height, or at twice their own.

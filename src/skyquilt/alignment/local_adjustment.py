@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.adjust import adjust
+from skyquilt.alignment.determined import lies_elsewhere
 from skyquilt.alignment.motion import velocities
 from skyquilt.alignment.oblique import told_tilt
 from skyquilt.alignment.problem import Problem, State, residuals_px
@@ -115,7 +116,7 @@ class LocalAdjustment:
     """Links that put a photo further apart than this share of the flying height contradict each
     other.
     """
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
 
     def __call__(self, window: Window) -> AdjustedWindow | NotAdjusted:
         """Places the new photo and refines the free ones."""
@@ -129,7 +130,7 @@ class LocalAdjustment:
             own = [(k.a, k.b) for k in window.links if window.new in (k.a, k.b)]
             dropped = tuple(key for key in own if key not in agreeing)
         links = [k for k in window.links if (k.a, k.b) not in dropped]
-        setup = held_setup(window, plane, links)
+        setup = without_false_positions(held_setup(window, plane, links), window)
         tracks = useful(setup.sensor_tracks(build_tracks(window.features, links)), window)
         sizes = [(p.width, p.height) for p in window.photos]
         problem, state = setup.problem(thin(tracks, sizes, per_photo=self.per_photo))
@@ -149,6 +150,20 @@ class LocalAdjustment:
             xyz=state.X,
             dropped=dropped,
         )
+
+
+def without_false_positions(setup: Setup, window: Window) -> Setup:
+    """The setup without reported positions of photos that start elsewhere, by their links or by
+    their former pose: one that is off by ten flying heights would bend all around it.
+    """
+    base = setup.base
+    C0, start = base.C0.copy(), setup.start_C
+    away = np.linalg.norm((start - C0)[:, :2], axis=1)
+    high = np.abs(start[:, 2] - window.ground)
+    sigma = np.maximum(base.sigma_C[:, 0], window.sigma_xy)
+    held = np.isin(setup.members, list(window.held))
+    C0[lies_elsewhere(away, sigma, high) & ~held, :2] = np.nan
+    return replace(setup, base=replace(base, C0=C0))
 
 
 def useful(tracks: Tracks, window: Window) -> Tracks:

@@ -2,6 +2,7 @@
 same source.
 """
 
+from bisect import bisect_left
 from collections import defaultdict, deque
 from typing import Any
 
@@ -16,10 +17,12 @@ from skyquilt.geometry.frames import (
     angles_from_cam_R_map,
     cam_R_map_from_angles,
 )
+from skyquilt.live.drifting_positions import foreseen, unforeseen_m
 from skyquilt.live.members import Member, Members
 from skyquilt.live.settings import LiveSettings
 from skyquilt.model.poses import Pose
 from skyquilt.ortho.height_cells import HeightCells
+from skyquilt.photos.survey import capture_order
 
 NOMINAL_M = 50.0
 """Assumed height above ground in m where the metadata do not contain one."""
@@ -87,7 +90,20 @@ class Metadata:
             0.0 if abs(turn) > 90 else prior.pitch_deg,
             0.0 if abs(turn) > 90 else prior.roll_deg,
         )
-        return Pose(cam_R_map=R, map_C=np.array([prior.map_C[0], prior.map_C[1], z]))
+        x, y = prior.map_C[:2] + foreseen(*self._errors(member))
+        return Pose(cam_R_map=R, map_C=np.array([x, y, z]))
+
+    def _errors(self, member: Member) -> tuple[NDArray[np.float64], int]:
+        """By how many metres (n, 2) the positions of recent photos of the source err, in the order
+        in which they were taken, and the place of a photo among them.
+        """
+        known = sorted(
+            (capture_order(m.photo), *(m.pose.map_C - m.prior.map_C)[:2].tolist())
+            for m in self._recent[_source(member)].values()
+            if m.pose is not None and m.id != member.id and np.isfinite(m.prior.map_C[:2]).all()
+        )
+        off = np.array([found[1:] for found in known], np.float64).reshape(-1, 2)
+        return off, bisect_left([found[0] for found in known], capture_order(member.photo))
 
     def _flown(self, member: Member) -> float:
         """The heading in degrees of a photo that reports none, by its direction of flight, as
@@ -148,7 +164,8 @@ class Metadata:
         if not np.isfinite(member.prior.yaw_deg):
             return True
         above = max(float(pose.map_C[2]) - self.ground_at(pose.map_C), 2.0)
-        if self.scatter() > LOOSE * above * member.photo.width / member.photo.focal.px:
+        off = unforeseen_m(self._errors(member)[0], self.scatter())
+        if off > LOOSE * above * member.photo.width / member.photo.focal.px:
             return True
         _, lifts, z = self._learned(member)
         if np.isfinite(member.prior.map_C[2]):

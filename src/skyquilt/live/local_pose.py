@@ -93,6 +93,9 @@ class LocalPose:
         links = self.live_links.compared(member, self.neighbours.of(member, member.pose))
         links |= more
         links |= self._strangers(member, member.pose, links)
+        if member.pose is not None and not any(links.values()):  # its position may be far off
+            near = [i for i in self.neighbours.taken_next(member) if (i, member.id) not in links]
+            links |= self.live_links.compared(member, near)
         good = {key: k for key, k in links.items() if k is not None}
         if not good:
             if self.live_links.shows_nothing(member.id, compared=bool(links)):

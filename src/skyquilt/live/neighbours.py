@@ -1,5 +1,6 @@
 """Chooses the photos with which a new one is compared, by a spatial index of camera positions."""
 
+from bisect import bisect_left, insort
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from itertools import islice
@@ -11,9 +12,10 @@ from numpy.typing import NDArray
 from skyquilt.alignment.determined import STATED_DEG
 from skyquilt.alignment.start import ground_of
 from skyquilt.live.drone_metadata import Metadata
-from skyquilt.live.members import Member, Members
+from skyquilt.live.members import ON_MAP, Member, Members
 from skyquilt.live.settings import NEIGHBOURS
 from skyquilt.model.poses import Pose
+from skyquilt.photos.survey import capture_order
 
 STRANGERS = 2
 """Photos of blocks that a photo is not linked with, with which it is compared besides."""
@@ -36,6 +38,8 @@ class Neighbours:
         self.members, self.metadata = members, metadata
         self._grid: dict[tuple[int, int], set[int]] = defaultdict(set)
         self._cell_of: dict[int, tuple[int, int]] = {}
+        self._taken: dict[tuple[str, ...], list[tuple[Any, int]]] = defaultdict(list)
+        """Photos of each drone in the order in which they were taken."""
         for member in members.on_map():
             if member.tried:
                 self.indexed(member)
@@ -48,6 +52,8 @@ class Neighbours:
         old = self._cell_of.get(member.id)
         if old is not None and old != (c, r):
             self._grid[old].discard(member.id)
+        if old is None:
+            insort(self._taken[_taken_by(member)], (capture_order(member.photo), member.id))
         self._cell_of[member.id] = (c, r)
         self._grid[c, r].add(member.id)
 
@@ -88,6 +94,21 @@ class Neighbours:
         )
         return list(islice(others, STRANGERS))
 
+    def taken_next(self, member: Member) -> list[int]:
+        """The photos that its drone took next before and after one, if they belong to other blocks
+        of linked photos: what is near by a position that is far off does not show the same. Those
+        with which it was compared are left out.
+        """
+        own = self._taken[_taken_by(member)]
+        at = bisect_left(own, (capture_order(member.photo), member.id))
+        block, known = self.members.block(member.id), self.members.ledger.compared
+        found = list[int]()
+        for places in (range(at - 1, -1, -1), range(at, len(own))):
+            ids = (own[k][1] for k in places)
+            shown = (i for i in ids if i != member.id and self.members.by_id[i].state in ON_MAP)
+            found += islice(shown, 1)
+        return [i for i in found if i not in block and not known(i, member.id)]
+
     def beside(self, member: Member) -> list[int]:
         """The photos of its band taken nearest to one, by their places on the map, those left out
         with which it was compared. Where each looks is no matter: it may be found wrongly.
@@ -112,7 +133,7 @@ class Neighbours:
         reach = (
             above * max(photo.width, photo.height) / photo.focal.px + 2 * self.metadata.scatter()
         )
-        found = []
+        found = list[int]()
         for i in self._near(at, reach + above):
             other = self.members.by_id[i]
             if i == member.id or other.photo.band != photo.band or other.state == "superseded":
@@ -178,3 +199,8 @@ class Neighbours:
             for i in (number - apart, number + apart):
                 if i in known:
                     yield known[i]
+
+
+def _taken_by(member: Member) -> tuple[str, ...]:
+    """The drone and the camera of a photo, and what it shows."""
+    return member.source, member.photo.camera_key, member.photo.band

@@ -305,8 +305,9 @@ class Refinement:
         return [*linked, *(m for m in others if self._links(m, member))]
 
     def rejoined(self) -> Update | None:
-        """Compares a photo outside the largest block with one of another block near it, where no
-        photos arrive: later photos were compared with those that were nearest only. Where they
+        """Compares a photo outside the largest block with one of another block near it, or taken
+        next to it, where no photos arrive: later photos were compared with those that were nearest
+        only. Where they
         match, it waits to be refined again, by that link, too, or it would be found again and
         again. So is one that looks aside and does not tell where with those around it: the block is
         adjusted anew with such links. None where there is no such photo.
@@ -366,7 +367,8 @@ class Refinement:
                 if member.id in largest or member.pose is None or not member.tried:
                     continue
                 if self.ledger.compared_with(member.id) < MOST_COMPARED:
-                    for i in self.local_pose.neighbours.strangers(member, member.pose):
+                    near = self.local_pose.neighbours
+                    for i in near.strangers(member, member.pose) or near.taken_next(member):
                         more = True
                         yield member, i
 
