@@ -11,16 +11,18 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.motion import headings_by_course
 from skyquilt.alignment.priors import choose_frame
+from skyquilt.alignment.setup import TURNED
 from skyquilt.errors import UsageError
 from skyquilt.geometry.frames import (
     angle_difference_deg,
     angles_from_cam_R_map,
     cam_R_map_from_angles,
 )
+from skyquilt.live.common_tilt import common_tilt
 from skyquilt.live.drifting_positions import foreseen, unforeseen_m
 from skyquilt.live.members import Member, Members
 from skyquilt.live.settings import LiveSettings
-from skyquilt.model.poses import Pose
+from skyquilt.model.poses import Pose, Prior
 from skyquilt.ortho.height_cells import HeightCells
 from skyquilt.photos.survey import capture_order
 
@@ -85,13 +87,22 @@ class Metadata:
             z = z + lift
         elif not np.isfinite(z) or (datum == "takeoff" and z < 3):
             z = self.ground_at(prior.map_C) + NOMINAL_M
-        R = cam_R_map_from_angles(
-            yaw,
-            0.0 if abs(turn) > 90 else prior.pitch_deg,
-            0.0 if abs(turn) > 90 else prior.roll_deg,
-        )
+        if abs(turn) > 90:
+            R = cam_R_map_from_angles(yaw, 0.0, 0.0)
+        else:
+            R = self._tilted(member) @ _told_R(prior, yaw)
         x, y = prior.map_C[:2] + foreseen(*self._errors(member))
         return Pose(cam_R_map=R, map_C=np.array([x, y, z]))
+
+    def _tilted(self, member: Member) -> NDArray[np.float64]:
+        """The turn (3, 3) by which recent photos of the source look elsewhere than they tell."""
+        known = [
+            (_told_R(m.prior, angles_from_cam_R_map(m.pose.cam_R_map)[0]), m.pose.cam_R_map)
+            for m in self._recent[_source(member)].values()
+            if m.pose is not None and m.id != member.id and not m.camera.endswith(TURNED)
+        ]
+        told, found = np.array(known).reshape(-1, 2, 3, 3).swapaxes(0, 1)
+        return common_tilt(told, found)
 
     def _errors(self, member: Member) -> tuple[NDArray[np.float64], int]:
         """By how many metres (n, 2) the positions of recent photos of the source err, in the order
@@ -224,6 +235,11 @@ class Metadata:
 
 def _source(member: Member) -> str:
     return f"{member.source}|{member.photo.camera_key}"
+
+
+def _told_R(prior: Prior, yaw_deg: float) -> NDArray[np.float64]:
+    """Where a photo looks by the tilt that it tells, headed so."""
+    return cam_R_map_from_angles(yaw_deg, prior.pitch_deg, prior.roll_deg)
 
 
 def _scatter(values: NDArray[np.float64]) -> float:

@@ -133,7 +133,7 @@ class Neighbours:
         reach = (
             above * max(photo.width, photo.height) / photo.focal.px + 2 * self.metadata.scatter()
         )
-        found = list[int]()
+        found = []
         for i in self._near(at, reach + above):
             other = self.members.by_id[i]
             if i == member.id or other.photo.band != photo.band or other.state == "superseded":

@@ -1,0 +1,30 @@
+"""What the tilts that a drone reports have in common beside those found: a gimbal that is off, or
+a camera that is mounted aslant. It is foreseen for the next photo.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.alignment.false_tilts import COMMON_DEG, COMMON_LEFT, FEWEST, LEAST_INSIDE
+from skyquilt.geometry.frames import rotation_from_vector
+
+Array = NDArray[np.float64]
+
+
+def common_tilt(told: Array, found: Array) -> Array:
+    """The rotation (3, 3) by which cameras turn from where they are told to look (n, 3, 3) to where
+    they were found to (n, 3, 3), both `cam_R_map` with the headings found; the identity where they
+    are few, or do not agree, by the rules of whole flights (`false_tilts.common_tilts`).
+    """
+    axes = np.einsum("nij,nj->ni", told, found[:, 2]) if len(told) else np.zeros((0, 3))
+    axes = axes[axes[:, 2] > LEAST_INSIDE]
+    if len(axes) < FEWEST:
+        return np.eye(3)
+    tangents = axes[:, :2] / axes[:, 2:]
+    x, y = np.median(tangents, axis=0)
+    off = float(np.degrees(np.arctan(np.hypot(x, y))))
+    left = float(np.degrees(np.median(np.linalg.norm(tangents - (x, y), axis=1))))
+    if off <= COMMON_DEG or left > COMMON_LEFT * off:
+        return np.eye(3)
+    axis = np.array([-y, x, 0.0]) / np.hypot(x, y)
+    return np.asarray(rotation_from_vector(-axis * np.radians(off)))
