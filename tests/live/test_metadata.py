@@ -209,6 +209,10 @@ def test_what_metadata_are_worth_tells_whether_photos_are_drawn_by_them(
     assert metadata.first(member).map_C[2] == member.prior.map_C[2] + 7.5
     z = [60, 61, 60, 59]
     assert metadata.first(member).map_C[2] == 60
+    for turns in ([20, -25, 170, -15], [172, 178, -179, np.nan]):  # headings all over; off by 180
+        learned = np.array([turns, [0.0] * 4, z])
+        monkeypatch.setattr(metadata, "_learned", lambda _, known=learned: known)
+        assert metadata.loose(member, pose) == (turns[0] == 20)
     live.members.by_id[1].tried = 0  # then there is nothing to be linked with
     live.members.by_id[2].tried = 0
     assert not metadata.loose(member, pose)

@@ -34,6 +34,8 @@ LOOSE, LOOSE_HIGH = 0.03, 0.2
 """Standard deviation of positions, as a share of a photo's width on the ground, and of heights, as
 one of that above it, from which half of all photos lie visibly beside their neighbours.
 """
+LOOSE_DEG = 10.0
+"""The same of the median error of headings: seams lie about a third of a width from the middle."""
 LEVEL, LEVEL_M, FEWEST = 2.0, 3.0, 3
 """Drones that flew level by what is refined, so many times better than heights are reported, go on
 at that level; deviation (m) of reported heights from which that is asked; photos that tell it.
@@ -167,8 +169,8 @@ class Metadata:
 
     def loose(self, member: Member, pose: Pose) -> bool:
         """Whether a photo will most likely lie beside its neighbours by this pose, from its
-        metadata: its heading is not known, or positions or heights of photos before it were badly
-        off. False where there is no photo to be linked with.
+        metadata: its heading is not known, or positions, heights or headings of photos before it
+        were badly off, each in another way. False where there is no photo to be linked with.
         """
         if not any(m.tried for m in self.members.on_map()):
             return False
@@ -178,7 +180,9 @@ class Metadata:
         off = unforeseen_m(self._errors(member)[0], self.scatter())
         if off > LOOSE * above * member.photo.width / member.photo.focal.px:
             return True
-        _, lifts, z = self._learned(member)
+        turns, lifts, z = self._learned(member)
+        if _astray_deg(turns[np.isfinite(turns)]) > LOOSE_DEG:
+            return True
         if np.isfinite(member.prior.map_C[2]):
             z, lifts = z[np.isfinite(lifts)], lifts[np.isfinite(lifts)]
         else:
@@ -245,6 +249,14 @@ def _told_R(prior: Prior, yaw_deg: float) -> NDArray[np.float64]:
 def _scatter(values: NDArray[np.float64]) -> float:
     """Median deviation from the median."""
     return float(np.median(np.abs(values - np.median(values))))
+
+
+def _astray_deg(turns: NDArray[np.float64]) -> float:
+    """Median error in degrees of headings beside what they err by in the mean; 0 of few."""
+    if len(turns) < FEWEST:
+        return 0.0
+    unit = np.exp(1j * np.radians(turns))
+    return float(np.degrees(np.median(np.abs(np.angle(unit * unit.sum().conj())))))
 
 
 def _level(lifts: NDArray[np.float64], z: NDArray[np.float64]) -> bool:
