@@ -7,7 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skyquilt.alignment.local_adjustment import LocalAdjustment, NotAdjusted, Window
+from skyquilt.alignment.local_adjustment import (
+    LocalAdjustment,
+    NotAdjusted,
+    Window,
+    held_setup,
+    similarity_of,
+    without_false_positions,
+)
 from skyquilt.model.features import Link
 from tests.alignment.test_oblique_start import CAMERA, Slanting
 
@@ -95,3 +102,19 @@ def test_positions_that_are_far_off_bend_nothing(seed):
     asked = window_on(flown, held={0, 1, 2})
     away, turned = off(flown, LocalAdjustment()(asked), asked.new)
     assert away < 1.0 and turned < 0.5
+
+
+def test_positions_hold_a_map_that_has_drifted():
+    """All photos around are off alike, by 20 m: then it is not the receiver that is."""
+    flown = Slanting([(0.0, 22.0 * k, 50.0, 0.0, 0.0) for k in range(-2, 4)], seed=1)
+    flown.priors[:] = [replace(p, map_C=p.map_C + [20.0, 0, 0]) for p in flown.priors]
+    asked = window_on(flown, held={0, 1, 2})
+    plane = {i: similarity_of(asked, i) for i in asked.poses}
+    setup = held_setup(asked, plane, asked.links)
+    assert np.isfinite(without_false_positions(setup, asked).base.C0).all()
+    alone = {4: replace(flown.priors[4], map_C=flown.priors[4].map_C + [300.0, 0, 0])}
+    priors = [alone.get(i, p) for i, p in enumerate(flown.priors)]
+    asked = replace(asked, priors=priors)
+    setup = held_setup(asked, plane, asked.links)
+    kept = np.isfinite(without_false_positions(setup, asked).base.C0[:, 0])
+    assert kept.tolist() == [True, True, True, True, False]
