@@ -154,18 +154,22 @@ class LocalAdjustment:
 
 def without_false_positions(setup: Setup, window: Window) -> Setup:
     """The setup without reported positions of photos that start elsewhere, by their links or by
-    their former pose, beside what those of held photos are off: one that is off by ten flying
-    heights would bend all around it. Where all are off alike, the map has drifted, not a receiver.
+    their former pose, beside what those of held photos are off that agree with theirs: one
+    that is off by ten flying heights would bend all around it. Where all held ones are off alike,
+    the map has drifted, not a receiver.
     """
     base = setup.base
     C0, start = base.C0.copy(), setup.start_C
     off = (start - C0)[:, :2]
     held = np.isin(setup.members, list(window.held))
     told = np.array([window.priors[m].map_C[:2] for m in setup.members.tolist()])
-    common = (start[:, :2] - told)[held & np.isfinite(told).all(1)]
-    away = np.linalg.norm(off - (np.median(common, axis=0) if len(common) else 0.0), axis=1)
     high = np.abs(start[:, 2] - window.ground)
     sigma = np.maximum(base.sigma_C[:, 0], window.sigma_xy)
+    known = held & np.isfinite(told).all(1)
+    common = start[:, :2] - told
+    right = known & ~lies_elsewhere(np.linalg.norm(common, axis=1), np.array(window.sigma_xy), high)
+    common = common[right if right.any() else known]
+    away = np.linalg.norm(off - (np.median(common, axis=0) if len(common) else 0.0), axis=1)
     C0[lies_elsewhere(away, sigma, high) & ~held, :2] = np.nan
     return replace(setup, base=replace(base, C0=C0))
 
