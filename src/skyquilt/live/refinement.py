@@ -307,9 +307,8 @@ class Refinement:
     def rejoined(self) -> Update | None:
         """Compares a photo outside the largest block with one of another block near it, or taken
         next to it, where no photos arrive: later photos were compared with those that were nearest
-        only. Where they
-        match, it waits to be refined again, by that link, too, or it would be found again and
-        again. So is one that looks aside and does not tell where with those around it: the block is
+        only. Where they match, it waits to be refined again, by that link, too, or it would be
+        found again and again. So is one that looks aside and does not tell where with those around it: the block is
         adjusted anew with such links. None where there is no such photo.
         """
         pair = next(self._pairs, None)
