@@ -308,8 +308,8 @@ class Refinement:
         """Compares a photo outside the largest block with one of another block near it, or taken
         next to it, where no photos arrive: later photos were compared with those that were nearest
         only. Where they match, it waits to be refined again, by that link, too, or it would be
-        found again and again. So is one that looks aside and does not tell where with those around it: the block is
-        adjusted anew with such links. None where there is no such photo.
+        found again and again. So is one that looks aside and does not tell where with those around
+        it: the block is adjusted anew with such links. None where there is no such photo.
         """
         pair = next(self._pairs, None)
         if pair is None:
