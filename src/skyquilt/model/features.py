@@ -65,8 +65,10 @@ class Features:
             d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), np.float32(1e-6))
         )
 
-    def __sizeof__(self) -> int:
-        return self.px.nbytes + self.size.nbytes + self.descriptors.nbytes
+    @property
+    def nbytes(self) -> int:
+        """Bytes in memory."""
+        return int(self.px.nbytes + self.size.nbytes + self.descriptors.nbytes)
 
 
 def numbers(index: NDArray[Any]) -> NDArray[np.integer[Any]]:

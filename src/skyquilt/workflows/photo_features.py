@@ -3,7 +3,6 @@
 The batch and live workflows both use `photo_features`, so that they share artefacts in a store.
 """
 
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, overload
@@ -59,7 +58,7 @@ class PhotoFeatures:
     @property
     def nbytes(self) -> int:
         """Bytes in memory."""
-        return sys.getsizeof(self.features) + int(self.thumbnail.nbytes + self.detail.nbytes)
+        return self.features.nbytes + int(self.thumbnail.nbytes + self.detail.nbytes)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -1,6 +1,5 @@
 """Features of the photos of fisheyes, found in their straightened pictures."""
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,18 +14,6 @@ from skyquilt.model.features import Features
 from skyquilt.model.photo import Photo
 from skyquilt.workflows.methods import Detector
 from skyquilt.workflows.photo_features import KEPT_BYTES, PICTURE, GreyPictures, features_recipe
-
-
-@dataclass(frozen=True)
-class _Straight:
-    """Features, with what they take."""
-
-    features: Features
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes in memory."""
-        return sys.getsizeof(self.features)
 
 
 @dataclass(kw_only=True, eq=False)
@@ -54,9 +41,9 @@ class Straightened:
         if self._lenses.get(photo) != lens:
             self._kept.drop(photo)
             self._lenses[photo] = lens
-        return self._kept(photo).features
+        return self._kept(photo)
 
-    def _found(self, photo: int) -> _Straight:
+    def _found(self, photo: int) -> Features:
         own, lens = self.photos[photo], self._lenses[photo]
 
         def found() -> Features:
@@ -67,6 +54,5 @@ class Straightened:
             return straightened_features(lens, self.grey(photo, PICTURE), full, longest, of)
 
         recipe = features_recipe(self.detector)
-        return _Straight(
-            self.store.get_or("features", digest(own.pixels_key, "straight", lens, recipe), found)
-        )
+        key = digest(own.pixels_key, "straight", lens, recipe)
+        return self.store.get_or("features", key, found)
