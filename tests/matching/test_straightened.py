@@ -60,10 +60,7 @@ def plain(picture):
 
 
 def straight(picture, camera, size=(HEIGHT, WIDTH)):
-    small = Sift()
-    return straightened_features(
-        camera, picture, size, small.longest, lambda p: small.of_shrunken(p, p.shape[:2])
-    )
+    return straightened_features(camera, picture, size, Sift())
 
 
 def shared(a, b, camera):

@@ -3,16 +3,26 @@
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from skyquilt.engine.store import Store
 from skyquilt.engine.workers import HERE
 from skyquilt.matching.sift import Sift
+from skyquilt.matching.straightened import straightened_features
+from skyquilt.model.camera import Camera
 from skyquilt.model.photo import Focal, Photo
+from skyquilt.photos.pixels import read_color
 from skyquilt.photos.read import read_photo
 from skyquilt.workflows.artefacts import REGISTRY
-from skyquilt.workflows.photo_features import FeaturedPhotos, find_features, of_one_kind
+from skyquilt.workflows.photo_features import (
+    FeaturedPhotos,
+    find_features,
+    of_one_kind,
+    photo_features,
+    picture_of,
+)
 from tests.photos.conftest import jpeg_bytes
 
 
@@ -54,9 +64,33 @@ def test_degrees_and_counts_are_not_one_kind():
     units = ["celsius", "counts", "celsius"]
     photos = [Photo(name=f"{k}", unit=u, focal=focal, **common) for k, u in enumerate(units)]
     found = of_one_kind(
-        FeaturedPhotos(photos=tuple(photos), number=(0, 1, 2), looks=None, rejected=())
+        FeaturedPhotos(photos=tuple(photos), number=(0, 1, 2), look=None, looks=None, rejected=())
     )
     assert [p.name for p in found.photos] == ["0", "2"]
     (left,) = found.rejected
     assert left.name == "1" and "thermal in counts" in left.reason
     assert "thermal in celsius" in left.reason
+
+
+@pytest.mark.parametrize("told_by", ["calibration", "shown_lens"])
+def test_features_of_a_fisheye_are_those_of_its_straightened_picture(tmp_path, told_by):
+    """Whether files tell that it is one, or photos showed it; plain ones are kept beside."""
+    path = tmp_path / "one.jpg"
+    blots = np.random.default_rng(1).uniform(0, 255, (40, 60)).astype(np.uint8)
+    blots = cv2.resize(blots, (480, 320), interpolation=cv2.INTER_CUBIC)
+    path.write_bytes(jpeg_bytes(np.repeat(blots[..., None], 3, axis=2)))
+    plain = read_photo(path)
+    lens = replace(Camera.ideal(width=480, height=320, focal=250.0), fisheye=1.0, k1=-0.02)
+    bent = replace(plain, **{told_by: lens})
+    store = Store(folder=tmp_path / "store", registry=REGISTRY)
+    found = {
+        p.lens.fisheye: photo_features(p, lambda: read_color(plain), Sift(), store)
+        for p in (bent, plain)
+    }
+    picture = picture_of(read_color(plain))
+    straight = straightened_features(bent.lens, picture, (320, 480), Sift())
+    assert np.array_equal(found[1].features.px, straight.px) and len(straight) > 100
+    assert np.array_equal(found[0].features.px, Sift()(picture).px)
+    assert np.array_equal(found[0].thumbnail, found[1].thumbnail)
+    kept = [photo_features(p, pytest.fail, Sift(), store).features for p in (plain, bent)]
+    assert np.array_equal(kept[1].px, straight.px) and not np.array_equal(kept[0].px, straight.px)

@@ -118,6 +118,8 @@ class LiveLinks:
         """
         before = {(k.a, k.b) for k in self._of(camera)}
         ids, again = self._ids(camera), set(before)
+        for i in ids if bent else ():
+            self._features.pop(i, None)  # found in pictures that are not straightened
         if marked:
             again |= {p for i in ids for p in self.members.ledger.unlike(i) if ids.issuperset(p)}
         links = [(a, b, self._compared(a, b)) for a, b in sorted(again)]

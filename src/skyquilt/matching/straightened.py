@@ -5,8 +5,7 @@ descriptors of the same place in the middle of one photo and near the rim of ano
 a pinhole photos of level ground differ by a similarity, wherever in them it lies.
 """
 
-from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -23,18 +22,26 @@ degrees a pinhole shows it four times as large as in the middle.
 """
 
 
+class Detector(Protocol):
+    """Finds features of pictures."""
+
+    @property
+    def longest(self) -> int:
+        """Longest side in px of the pictures that are searched."""
+        ...
+
+    def of_shrunken(self, small: NDArray[Any], full: tuple[int, int]) -> Features:
+        """Features of a picture; `full` is the (H, W) that they refer to."""
+        ...
+
+
 def straightened_features(
-    lens: Camera,
-    picture: NDArray[Any],
-    full: tuple[int, int],
-    longest: int,
-    found: Callable[[NDArray[Any]], Features],
+    lens: Camera, picture: NDArray[Any], full: tuple[int, int], detector: Detector
 ) -> Features:
     """Features of a fisheye's picture (h, w), px of its full size (H, W): found in what a pinhole
-    would show of it, in the middle as large as in a picture of `longest` px on its longest side.
-    `found` gives the features of pixels as they are.
+    would show of it, in the middle as large as in the pictures that the detector searches.
     """
-    focal = lens.focal * min(1.0, longest / max(full))
+    focal = lens.focal * min(1.0, detector.longest / max(full))
     across, down = (
         int(2 * focal * np.tan(min(side / (2 * lens.focal), MOST_AWAY_RAD)))
         for side in (full[1], full[0])
@@ -52,7 +59,8 @@ def straightened_features(
         np.asarray(axis, np.float32).reshape(down, across)
         for axis in shrunken_px(at[:, 0], at[:, 1], picture.shape, full)
     )
-    features = found(cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+    straight = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    features = detector.of_shrunken(straight, (down, across))
     scale = lens.focal / focal
     return Features(
         px=seen(features.px),

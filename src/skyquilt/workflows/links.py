@@ -30,7 +30,6 @@ from skyquilt.model.poses import MapFrame, Prior
 from skyquilt.ortho.tie_surface import level
 from skyquilt.workflows.methods import Methods
 from skyquilt.workflows.photo_features import FeaturedPhotos, GreyPictures, features_recipe
-from skyquilt.workflows.straightened import Straightened
 
 
 class ExpectedPlaces:
@@ -286,7 +285,7 @@ def of_unknown_kind(photos: Sequence[Photo]) -> dict[str, Camera]:
 
 
 def with_fisheyes(
-    found: FeaturedPhotos, links: Links, grey: GreyPictures, methods: Methods, store: Store
+    found: FeaturedPhotos, links: Links, methods: Methods
 ) -> tuple[FeaturedPhotos, tuple[str, ...]]:
     """The photos, those of cameras that prove to have a fisheye with such a lens, and notes on
     them; the same where there are none. Links must be found again for these.
@@ -301,7 +300,9 @@ def with_fisheyes(
         matches = _on_ground(matcher(*two), marked)
         return two[0].px[matches.index_a], two[1].px[matches.index_b]
 
-    straight = Straightened(photos=found.photos, grey=grey, detector=methods.detector, store=store)
+    def straight(photo: int, lens: Camera) -> Features:
+        own = replace(found.photos[photo], shown_lens=lens)
+        return found.look(found.number[photo], own).features
 
     def shared(a: int, b: int, lens: Camera) -> int:
         two = straight(a, lens), straight(b, lens)
@@ -315,13 +316,8 @@ def with_fisheyes(
     lenses = fisheyes(cameras, asked, features.__getitem__, links.links, tried, matched, shared)
     if not lenses:
         return found, ()
-    photos = tuple(
-        replace(p, shown_lens=lenses[p.camera_key]) if p.camera_key in lenses else p
-        for p in found.photos
-    )
-    return replace(found, photos=photos, straight=straight), tuple(
-        fisheye_note(camera) for camera in lenses
-    )
+    notes = tuple(fisheye_note(camera) for camera in lenses)
+    return found.through(lenses), notes
 
 
 def link_photos(

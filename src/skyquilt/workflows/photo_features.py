@@ -69,21 +69,33 @@ class FeaturedPhotos:
     """The photos, in order of capture."""
     number: tuple[int, ...]
     """Number of each photo in `looks`."""
+    look: Callable[[int, Photo], PhotoFeatures]
+    """Features and thumbnail of a photo by its number, from the store or computed now."""
     looks: PixelCache[PhotoFeatures]
-    """Features and thumbnail of a photo by its number, from the store unless used lately."""
+    """The same by its number, unless used lately."""
     rejected: tuple[RejectedPhoto, ...]
     """Photos that cannot be used, with reasons."""
     closer: Callable[[int], Features] | None = None
     """Gives the features found in a second look (`workflows.second_look`)."""
     again: frozenset[int] = frozenset()
     """Photos that were looked at twice."""
-    straight: Callable[[int, Camera], Features] | None = None
-    """Gives the features of photos of fisheyes."""
 
     @property
     def features(self) -> Sequence[Features]:
         """Features per photo; read when asked for, so that memory does not hold those of all."""
         return _FeaturesOf(self)
+
+    def through(self, lenses: Mapping[str, Camera]) -> "FeaturedPhotos":
+        """The same photos, those of some cameras (`camera_key`) with other lenses."""
+        photos = tuple(
+            replace(p, shown_lens=lenses[p.camera_key]) if p.camera_key in lenses else p
+            for p in self.photos
+        )
+        by_number = dict(zip(self.number, photos, strict=True))
+        looks = PixelCache(
+            read=lambda n: self.look(n, by_number[n]), budget_bytes=self.looks.budget_bytes
+        )
+        return replace(self, photos=photos, looks=looks)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -116,12 +128,7 @@ class _FeaturesOf(Sequence[Features]):
         if isinstance(photo, slice):
             return [self[i] for i in range(*photo.indices(len(self)))]
         found = self._found
-        lens = found.photos[photo].lens
-        features = (
-            found.straight(photo, lens)
-            if found.straight is not None and lens.fisheye
-            else found.looks(found.number[photo]).features
-        )
+        features = found.looks(found.number[photo]).features
         if found.closer is None or photo not in found.again:
             return features
         return features.followed_by(found.closer(photo))
@@ -270,7 +277,8 @@ def pixels_again(photo: Photo) -> NDArray[Any]:
 
 def features_key(photo: Photo, detector: Detector) -> str:
     """The key of a photo's features and thumbnail in the store."""
-    return digest(photo.pixels_key, features_recipe(detector))
+    bent = (photo.lens,) if photo.lens.fisheye else ()
+    return digest(photo.pixels_key, features_recipe(detector), *bent)
 
 
 def features_recipe(detector: Detector) -> tuple[Any, ...]:
@@ -312,7 +320,8 @@ def photo_features(
     photo: Photo, pixels: Callable[[], NDArray[Any]], detector: Detector, store: Store
 ) -> PhotoFeatures:
     """Features and thumbnail of a photo, from the store or computed now; its grey image is stored
-    beside them. `pixels` decodes the photo.
+    beside them. `pixels` decodes the photo. Features of a fisheye's are found in its straightened
+    picture.
 
     Raises:
         UnreadablePhotoError: its pixels cannot be decoded.
@@ -324,15 +333,16 @@ def photo_features(
 
 def _look(photo: Photo, pixels: NDArray[Any], detector: Detector, store: Store) -> PhotoFeatures:
     rough = halved(pixels, PICTURE)
-    picture = picture_of(rough)
+    picture, longest, full = picture_of(rough), detector.longest, pixels.shape[:2]
     store.put("pictures", picture_key(photo), picture)
-    longest = detector.longest
-    if longest > PICTURE:
-        source = pixels
-    # sensor values are converted to grey at the size that is searched, since equalisation is local
+    if photo.lens.fisheye:
+        found = straightened_features(photo.lens, picture, full, detector)
+    elif longest > PICTURE:
+        found = detector.of_shrunken(shrink(pixels, longest)[0], full)
     else:
+        # sensor values become grey at the size that is searched, since equalisation is local
         source = picture if rough.dtype == np.uint8 else shrink(rough, PICTURE)[0]
-    found = detector.of_shrunken(shrink(source, longest)[0], pixels.shape[:2])
+        found = detector.of_shrunken(shrink(source, longest)[0], full)
     return PhotoFeatures(features=found, thumbnail=thumbnail_of(rough), detail=detail(pixels))
 
 
@@ -348,10 +358,10 @@ def find_features(
     """
     cv2.setNumThreads(1)  # photos are processed in parallel instead
 
-    looks = PixelCache(
-        read=lambda i: photo_features(photos[i], lambda: pixels(i), detector, store),
-        budget_bytes=KEPT_BYTES,
-    )
+    def look(number: int, photo: Photo) -> PhotoFeatures:
+        return photo_features(photo, lambda: pixels(number), detector, store)
+
+    looks = PixelCache(read=lambda i: look(i, photos[i]), budget_bytes=KEPT_BYTES)
 
     def failure(index: int) -> RejectedPhoto | None:
         try:
@@ -379,7 +389,11 @@ def find_features(
             f"none of {len(photos)} photos could be decoded; the first: {bad[0].reason}"
         )
     return FeaturedPhotos(
-        photos=tuple(photos[i] for i in good), number=tuple(good), looks=looks, rejected=tuple(bad)
+        photos=tuple(photos[i] for i in good),
+        number=tuple(good),
+        look=look,
+        looks=looks,
+        rejected=tuple(bad),
     )
 
 
