@@ -126,17 +126,26 @@ def common_tilts(
         fit = _fitted(seen, _Group(rows, high, scatter, lines))
     said, corrected = [], list(priors)
     for number, name in enumerate(names):
-        x = _known(fit, number)
-        off = float(np.degrees(np.arctan(np.linalg.norm(x))))
-        left = np.degrees(np.median(fit.left[camera == number]))
-        if off <= COMMON_DEG or left > COMMON_LEFT * off:
+        common = common_turn(_known(fit, number), fit.left[camera == number])
+        if common is None:
             continue
-        axis = np.array([-x[1], x[0], 0.0])
-        back = rotation_from_vector(axis / np.linalg.norm(axis) * np.radians(off))
+        off, back = common
         for i in _stated_by(name, priors, cameras):
             corrected[i] = turned_prior(priors[i], back)
         said.append(COMMON_NOTE.format(name, off))
     return (corrected if said else priors), tuple(said)
+
+
+def common_turn(x: Array, left: Array) -> tuple[float, Array] | None:
+    """The error in degrees that axes have in common which are told at tangents x (2,) beside where
+    they were found, and the rotation (3, 3) that takes it back; None where it is small, or leaves
+    too much of the tangents: lengths (n,).
+    """
+    off = float(np.degrees(np.arctan(np.linalg.norm(x))))
+    if off <= COMMON_DEG or np.degrees(np.median(left)) > COMMON_LEFT * off:
+        return None
+    axis = np.array([-x[1], x[0], 0.0])
+    return off, rotation_from_vector(axis / np.linalg.norm(axis) * np.radians(off))
 
 
 def leaning_lines(

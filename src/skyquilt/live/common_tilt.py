@@ -5,8 +5,7 @@ a camera that is mounted aslant. It is foreseen for the next photo.
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.false_tilts import COMMON_DEG, COMMON_LEFT, FEWEST, LEAST_INSIDE
-from skyquilt.geometry.frames import rotation_from_vector
+from skyquilt.alignment.false_tilts import FEWEST, LEAST_INSIDE, common_turn
 
 Array = NDArray[np.float64]
 
@@ -21,10 +20,6 @@ def common_tilt(told: Array, found: Array) -> Array:
     if len(axes) < FEWEST:
         return np.eye(3)
     tangents = axes[:, :2] / axes[:, 2:]
-    x, y = np.median(tangents, axis=0)
-    off = float(np.degrees(np.arctan(np.hypot(x, y))))
-    left = float(np.degrees(np.median(np.linalg.norm(tangents - (x, y), axis=1))))
-    if off <= COMMON_DEG or left > COMMON_LEFT * off:
-        return np.eye(3)
-    axis = np.array([-y, x, 0.0]) / np.hypot(x, y)
-    return np.asarray(rotation_from_vector(-axis * np.radians(off)))
+    middle = np.median(tangents, axis=0)
+    common = common_turn(middle, np.linalg.norm(tangents - middle, axis=1))
+    return np.eye(3) if common is None else common[1].T

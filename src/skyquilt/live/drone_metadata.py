@@ -19,7 +19,7 @@ from skyquilt.geometry.frames import (
     cam_R_map_from_angles,
 )
 from skyquilt.live.common_tilt import common_tilt
-from skyquilt.live.drifting_positions import foreseen, unforeseen_m
+from skyquilt.live.drifting_positions import RAYLEIGH, foreseen, unforeseen_m
 from skyquilt.live.members import Member, Members
 from skyquilt.live.settings import LiveSettings
 from skyquilt.model.poses import Pose, Prior
@@ -234,7 +234,7 @@ class Metadata:
         """Standard deviation per axis, in m, of reported positions, estimated from the refined
         photos.
         """
-        return float(np.median(self._misfit)) / 1.18 if len(self._misfit) >= 5 else 0.0
+        return float(np.median(self._misfit)) / RAYLEIGH if len(self._misfit) >= 5 else 0.0
 
 
 def _source(member: Member) -> str:

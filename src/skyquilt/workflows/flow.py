@@ -408,7 +408,7 @@ def _links(
     if len(found.photos) < 2 or not (methods.align.needs_links or of_unknown_kind(found.photos)):
         return found, Links()
     links = yield from link_photos(found, frame, reported, methods, store, workers)
-    again, said = with_fisheyes(found, links, methods)
+    again, said = with_fisheyes(found, links, grey, methods)
     if not methods.align.needs_links:
         return again, Links(lenses=said)
     if said:

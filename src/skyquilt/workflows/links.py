@@ -23,13 +23,14 @@ from skyquilt.matching.candidates import Pair, by_camera, closest, overlap_reach
 from skyquilt.matching.fixed_marks import FindFixedMarks, FixedMarks
 from skyquilt.matching.lens_kind import fisheye_note, fisheyes, may_be_fisheye
 from skyquilt.matching.matchers import Guided
+from skyquilt.matching.straightened import straightened_features
 from skyquilt.model.camera import Camera
 from skyquilt.model.features import Features, Link, Matches, RejectedLink, numbers
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import MapFrame, Prior
 from skyquilt.ortho.tie_surface import level
 from skyquilt.workflows.methods import Methods
-from skyquilt.workflows.photo_features import FeaturedPhotos, GreyPictures, features_recipe
+from skyquilt.workflows.photo_features import PICTURE, FeaturedPhotos, GreyPictures, features_recipe
 
 
 class ExpectedPlaces:
@@ -285,7 +286,7 @@ def of_unknown_kind(photos: Sequence[Photo]) -> dict[str, Camera]:
 
 
 def with_fisheyes(
-    found: FeaturedPhotos, links: Links, methods: Methods
+    found: FeaturedPhotos, links: Links, grey: GreyPictures, methods: Methods
 ) -> tuple[FeaturedPhotos, tuple[str, ...]]:
     """The photos, those of cameras that prove to have a fisheye with such a lens, and notes on
     them; the same where there are none. Links must be found again for these.
@@ -301,8 +302,8 @@ def with_fisheyes(
         return two[0].px[matches.index_a], two[1].px[matches.index_b]
 
     def straight(photo: int, lens: Camera) -> Features:
-        own = replace(found.photos[photo], shown_lens=lens)
-        return found.look(found.number[photo], own).features
+        full = found.photos[photo].height, found.photos[photo].width
+        return straightened_features(lens, grey(photo, PICTURE), full, methods.detector)
 
     def shared(a: int, b: int, lens: Camera) -> int:
         two = straight(a, lens), straight(b, lens)
