@@ -123,6 +123,7 @@ def test_the_accuracy_is_told_alike_of_all_parts(flown, grown):
     assert near[0].mean() == pytest.approx(near[1].mean(), rel=0.25)
 
 
+@pytest.mark.slow
 def test_nothing_new_changes_nothing(flown):
     whole = METHOD(flown.photos, FRAME, flown.priors, flown.features, flown.links)
     again = added(inputs(flown, whole), METHOD)
@@ -141,6 +142,7 @@ def test_photos_that_join_two_blocks_need_all_of_them(flown):
     assert added(inputs(halves, former), METHOD) is None
 
 
+@pytest.mark.slow
 def test_many_new_photos_need_a_new_adjustment(flown):
     gone = tuple(range(26, 56))
     assert added(inputs(flown, without(flown, gone)), METHOD) is None
@@ -157,6 +159,7 @@ def test_a_new_photo_without_links_is_left_to_its_metadata(flown, former):
     assert sorted(found.poses) == sorted(former.poses)
 
 
+@pytest.mark.slow
 def test_photos_of_another_focus_do_not_fit_on_the_block(flown, former):
     """Their pictures are 5 % larger than the block's calibration says: the block has to change."""
     other = Flown(1, lines=7, per_line=8, points=1500)

@@ -171,9 +171,8 @@ def gradients(problem, state):
     return photos, normal.gc + priors.camera_gradient, normal.gv
 
 
-@pytest.mark.parametrize(
-    ("points", "offset"), [(60, False), pytest.param(3000, True, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("points", "offset"), [(60, False), (3000, True)])
 def test_the_divided_system_is_the_dense_one(monkeypatch, points, offset):
     """Nested dissection gives the step and the covariance of one dense matrix; 3000 points: several
     parts.
@@ -285,6 +284,7 @@ def test_exact_observations_give_the_exact_block():
     assert pytest.approx(block.truth.K, abs=1e-4) == found.state.K
 
 
+@pytest.mark.slow
 def test_a_block_with_lies_is_recovered_within_its_deviations():
     """3 lines x 6, 0.3 px, 3 % lies, 1.5 m GPS. The window has two sides: suspiciously good fails
     too.
@@ -319,6 +319,7 @@ def test_a_block_with_lies_is_recovered_within_its_deviations():
     assert 0.15 < np.mean(errors) < 0.9
 
 
+@pytest.mark.slow
 def test_deviations_are_calibrated():
     """Normalised squared errors of plain least squares follow chi-squared over 24 blocks.
 
@@ -351,6 +352,7 @@ def test_deviations_are_calibrated():
     assert 0.6 < np.sqrt((z**2).mean()) < 1.4
 
 
+@pytest.mark.slow
 def test_the_truth_costs_what_chi_squared_says():
     """The cost at the true poses (points settled) less that of the minimum is chi-squared, however
     bent the valley.

@@ -219,6 +219,7 @@ def test_tie_points_project_where_they_were_seen(plain):
     assert (np.diff(t.point) >= 0).all() and np.bincount(t.point).min() >= 2
 
 
+@pytest.mark.slow
 def test_files_turned_by_half_a_turn(plain):
     """The middle line upside down: the same residuals and ground, its calibration mirrored, its
     poses turned.
@@ -270,6 +271,7 @@ def test_yaws_that_lie_do_not_matter(plain):
     assert relative_error(flown, found) < relative_error(*plain) + 0.1
 
 
+@pytest.mark.slow
 def test_a_position_that_lies_is_outvoted():
     flown = Flown(2)
     flown.priors[4] = replace(flown.priors[4], map_C=flown.priors[4].map_C + (60.0, -40.0, 0.0))
@@ -281,6 +283,7 @@ def test_a_position_that_lies_is_outvoted():
     )  # `--trust-metadata` believes it
 
 
+@pytest.mark.slow
 def test_two_blocks_are_both_kept():
     flown = Flown(3)
     flown.links = [k for k in flown.links if (k.a < 12) == (k.b < 12)]
@@ -345,6 +348,7 @@ def test_drift_is_what_neighbours_share():
     assert drift(np.full((10, 2), np.nan)) == 0.0
 
 
+@pytest.mark.slow
 def test_heights_that_drift_leave_the_map_as_uncertain(plain):
     flown, found = plain
     drifting = Flown(4)
@@ -425,6 +429,7 @@ def surveyed(flown, *, offset=0.0, checks=()):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("offset", [0.0, np.array([1.5, -2.0, 430.0])])
 def test_control_points_move_the_block_to_the_ground(offset):
     """The GPS shares an offset with nothing on the ground: the points win, in height by hundreds of
@@ -466,6 +471,7 @@ def without_positions(flown):
     return flown
 
 
+@pytest.mark.slow
 def test_three_control_points_georeference_photos_without_positions():
     flown = without_positions(Flown(7))
     found = flown.aligned(control=surveyed(flown, checks=(4, 5)))
@@ -588,9 +594,8 @@ def test_copies_of_one_picture_are_refused_with_the_reason():
         placed(found)
 
 
-@pytest.mark.parametrize(
-    "aspect", [1.03, *(pytest.param(a, marks=SLOW) for a in (0.75, 0.95, 1.33))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("aspect", [1.03, 0.75, 0.95, 1.33])
 def test_pictures_that_are_stretched_are_taken_as_they_are(aspect):
     """As well as pictures that nobody resized, whose centres are found to 0.35 m."""
     flown = Flown(lens=stretched(aspect))
@@ -634,9 +639,8 @@ def test_a_guessed_focal_length_far_from_the_true_one_is_guessed_again():
     assert not any("shutter" in n for n in found.notes)
 
 
-@pytest.mark.parametrize(
-    "times", [0.5, *(pytest.param(k, marks=SLOW) for k in (0.4, 0.65, 1.5, 2.5))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("times", [0.5, 0.4, 0.65, 1.5, 2.5])
 def test_a_focal_length_that_files_tell_falsely_is_not_believed(times, plain):
     """Known to 5 % as they say; believed, one of half the length ended 52 % off."""
     flown = Flown()
@@ -665,7 +669,7 @@ def test_a_camera_told_falsely_beside_one_that_is_not_told():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=SLOW) for k in (1, 2))])
+@pytest.mark.parametrize("seed", [0, 1, 2])
 def test_photos_cropped_towards_a_corner_keep_their_lens(seed):
     """The axis meets them 150 px right and 110 px below the middle; two lines that were flown in
     opposite directions look like displaced positions then.
@@ -681,11 +685,13 @@ def test_photos_cropped_towards_a_corner_keep_their_lens(seed):
     assert not any("displaced" in n for n in found.notes)
 
 
+@pytest.mark.slow
 def test_ordinary_pictures_are_not_called_stretched(plain):
     notes = " ".join((*plain[1].notes, *Flown(1).aligned().notes))
     assert "anamorphic" not in notes and "do not fit" not in notes
 
 
+@pytest.mark.slow
 def test_a_stretched_picture_that_its_calibration_tells_is_not_named():
     flown = Flown(lens=stretched(0.75))
     told = Camera(width=WIDTH, height=HEIGHT, focal=LENS[0], cx=LENS[1], cy=LENS[2], aspect=0.75)
@@ -695,7 +701,8 @@ def test_a_stretched_picture_that_its_calibration_tells_is_not_named():
     assert not any("anamorphic" in n for n in found.notes)
 
 
-@pytest.mark.parametrize("axis", [slice(0, 2), pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("axis", [slice(0, 2), 2])
 def test_positions_that_are_wrong_by_themselves_do_not_draw_the_block(axis):
     """Two photos that tell each other's place, or heights 40 m too large: what is found is what is
     found without their positions.

@@ -119,6 +119,7 @@ def test_a_panorama_keeps_its_positions_and_is_placed_by_its_angles(tilt, drift_
     assert (found.method == "bundle") == (drift_m > 0.2)
 
 
+@pytest.mark.slow
 def test_oblique_photos_whose_positions_are_those_of_the_remote_control():
     survey = Slanting(
         [(x, y, 45.0, 0.0, 50.0) for y in (-60, -42, -24) for x in range(-54, 60, 18)]

@@ -60,6 +60,7 @@ def test_three_flights_one_of_which_knows_better():
     assert np.abs(shift[12:24]).max() < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [8, 12, 24, 150])
 @pytest.mark.parametrize("seed", range(5))
 def test_noise_and_gross_errors_are_no_parts(count, seed):

@@ -127,6 +127,7 @@ def test_the_accuracy_is_not_that_of_points_too_uncertain_for_the_ground(block):
     assert left.sigma_m.max() < 2.0
 
 
+@pytest.mark.slow
 def test_points_that_nothing_determines_tell_nothing_of_the_ground(monkeypatch):
     """Of every tenth point the deviation is that of no information."""
     plain = Flown(3).aligned().accuracy
@@ -145,6 +146,7 @@ def test_points_that_nothing_determines_tell_nothing_of_the_ground(monkeypatch):
     assert Flown(3).aligned().accuracy.sigma_m.min() > 31622  # all that is known
 
 
+@pytest.mark.slow
 def test_photos_without_a_position_state_no_deviation_of_it():
     """Four of the photos have a position, known to 4 m: so well is the place of the map."""
     flown = Flown(4, gps=4.0)

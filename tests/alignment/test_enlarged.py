@@ -29,10 +29,8 @@ def without_heights(flown):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("told", [True, pytest.param(False, marks=pytest.mark.slow)])
-@pytest.mark.parametrize(
-    "factors", [(1.0, 1.4), pytest.param((1.0, 1.3, 1.7), marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("told", [True, False])
+@pytest.mark.parametrize("factors", [(1.0, 1.4), (1.0, 1.3, 1.7)])
 def test_photos_that_are_enlarged_are_calibrated_by_themselves(told, factors):
     flown = Flown(1, lines=4, per_line=6, points=500, gps=0.5)
     each = np.resize(factors, len(flown.photos))
@@ -50,7 +48,8 @@ def test_photos_that_are_enlarged_are_calibrated_by_themselves(told, factors):
     assert np.ptp(off[:, 2]) < 1.5
 
 
-@pytest.mark.parametrize("told", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("told", [True, False])
 def test_flights_at_two_heights_are_no_zoom(told):
     flown = Flown(2, lines=4, per_line=6, points=500, gps=0.5, heights=(45.0, 70.0))
     if not told:

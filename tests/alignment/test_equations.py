@@ -105,6 +105,7 @@ def factored(monkeypatch):
     return made
 
 
+@pytest.mark.slow
 def test_one_factor_serves_adjustments_of_many_photos(factored, monkeypatch):
     """They end where those with a factor for each step end."""
     block, near = make_block(3, lies=0.02), NearFactor()
@@ -121,6 +122,7 @@ def test_one_factor_serves_adjustments_of_many_photos(factored, monkeypatch):
     assert np.abs(found.state.C - exact.state.C).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_an_interrupted_adjustment_of_many_photos_goes_on_with_the_same_figures(factored):
     block = make_block(4, lies=0.02)
     kept = {}

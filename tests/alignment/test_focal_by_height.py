@@ -26,9 +26,8 @@ def aligned(survey, priors):
     return Auto(bundle=ByLinks(), pose=by_pose(None, repair=True))(inputs(survey, priors))
 
 
-@pytest.mark.parametrize(
-    ("times", "gps"), [(3.0, 1.5), pytest.param(6.0, 0.5, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("times", "gps"), [(3.0, 1.5), (6.0, 0.5)])
 def test_heights_and_positions_tell_it(times, gps):
     survey = flown(times, gps=gps)
     found = aligned(survey, survey.priors)

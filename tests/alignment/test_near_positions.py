@@ -58,11 +58,8 @@ def off(survey, found):
     return abs(high / true - 1), abs(float(np.median(yaws)))
 
 
-@pytest.mark.parametrize(
-    "places",
-    [*(pytest.param(p, marks=pytest.mark.slow) for p in (ROW, SQUARE)), HOVER],
-    ids=["row", "square", "hover"],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("places", [ROW, SQUARE, HOVER], ids=["row", "square", "hover"])
 def test_few_photos_are_as_large_as_their_heights_tell(places, monkeypatch):
     surveys = [flown(places, seed) for seed in (1, 3)]
     told = [off(s, adjusted(s)) for s in surveys]
@@ -114,6 +111,7 @@ def test_why_positions_tell_little_is_said_as_it_is():
         assert notes and all(note.startswith(why) for note in notes)
 
 
+@pytest.mark.slow
 def test_positions_that_tell_scale_and_direction_are_not_touched():
     for survey in (flown(WIDE, 0), flown(SQUARE, 0, gps=0.02, height_off=9.0)):
         found = adjusted(survey)
@@ -157,6 +155,7 @@ def test_photos_show_the_same_after_a_map_was_turned_and_enlarged():
     np.testing.assert_allclose(back.accuracy.xyz, found.accuracy.xyz, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_weights_err_less_than_either_scale_and_than_any_fixed_weight():
     """Drawn from what is assumed: ground of any height, receivers of both kinds."""
     rng = np.random.default_rng(1)

@@ -141,7 +141,7 @@ def by_hand(seed, count=22):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [3, pytest.param(5, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [3, 5])
 def test_photos_by_hand_are_placed_without_angles(seed):
     """Where links, taken for similarities of the ground's plane, put some of them elsewhere."""
     flown = Slanting(by_hand(seed), gps=3.0, seed=seed, alike_deg=60)
@@ -172,8 +172,9 @@ def there_and_back(pitch):
     return places
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("pitch", [25, pytest.param(32, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("pitch", [25, 32])
 def test_photos_that_look_somewhat_aslant_are_placed_by_what_they_report(pitch, seed):
     """Links of these, taken for similarities of the ground's plane, put half of such blocks where
     all positions looked like gross errors, 11 to 16 m away.
@@ -313,8 +314,9 @@ def swaying(seed, off=0.0, without=()):
     return flown
 
 
-@pytest.mark.parametrize("off", [60.0, pytest.param(12.0, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("seed", [2, *(pytest.param(s, marks=pytest.mark.slow) for s in (4, 5))])
+@pytest.mark.slow
+@pytest.mark.parametrize("off", [60.0, 12.0])
+@pytest.mark.parametrize("seed", [2, 4, 5])
 def test_a_compass_does_not_turn_photos_that_sway(seed, off):
     """Their tilts point elsewhere by as much as the compass is off, which held the map by it: it
     was turned by 2 to 15 degrees.
@@ -326,7 +328,7 @@ def test_a_compass_does_not_turn_photos_that_sway(seed, off):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [5, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [5, 2])
 def test_photos_that_sway_and_have_no_position_begin_beside_their_neighbours(seed, monkeypatch):
     begun = []
     kept = oblique_start.beginnings
@@ -482,7 +484,8 @@ def test_headings_that_are_all_false_by_one_angle_are_corrected(turn):
     assert np.median(turned) < 1.0
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(s, marks=pytest.mark.slow) for s in (1, 2))])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1, 2])
 def test_pitch_counted_from_straight_down_is_found_by_the_pictures(seed):
     flown = Slanting(grid(2), seed=seed)
     ahead = [replace(p, yaw_deg=p.yaw_deg, pitch_deg=p.pitch_deg + 90) for p in flown.priors]
@@ -496,14 +499,9 @@ def test_pitch_counted_from_straight_down_is_found_by_the_pictures(seed):
         assert np.degrees(np.arccos((np.trace(R @ where.cam_R_map.T) - 1) / 2)) < 5
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error::RuntimeWarning")
-@pytest.mark.parametrize(
-    "told",
-    [
-        "alike",
-        *(pytest.param(k, marks=pytest.mark.slow) for k in ("some", "compass", "gimbal yaw")),
-    ],
-)
+@pytest.mark.parametrize("told", ["alike", "some", "compass", "gimbal yaw"])
 def test_photos_that_look_down_whatever_they_report_are_found_by_the_pictures(told):
     """One angle in all files; pitch counted from straight down in some; a compass that is off as
     well, or headings that tell nothing.
@@ -579,6 +577,7 @@ def test_heights_that_drift_tilt_no_photo():
     assert tilt_warnings(flown.priors, found) == []
 
 
+@pytest.mark.slow
 def test_what_photos_report_is_kept_where_no_guess_is_clearly_better():
     for places in SURVEYS.values():
         flown = Slanting(places)
@@ -587,6 +586,7 @@ def test_what_photos_report_is_kept_where_no_guess_is_clearly_better():
     assert guessed_priors(flown.photos, nowhere, flown.features, flown.links) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("share", "taken"), [(3, False), (1, True)])
 def test_a_guess_that_leaves_the_pictures_for_the_positions_is_not_taken(monkeypatch, share, taken):
     """Mirrored or garbled positions suggest directions with which some matched rays meet: photos

@@ -124,6 +124,7 @@ def test_a_crs_that_does_not_suit_the_place(crs, place, words):
         choose_frame([at(*place)], crs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("crs", "place", "told"),
     [

@@ -103,6 +103,7 @@ def test_points_are_found_from_moving_cameras():
     assert np.median(first) < 0.01
 
 
+@pytest.mark.slow
 def test_the_readout_is_determined_where_lines_go_both_ways_without_turning():
     errors = []
     for seed in range(3):
@@ -115,6 +116,7 @@ def test_the_readout_is_determined_where_lines_go_both_ways_without_turning():
     assert np.sqrt(np.mean(np.square(errors))) < 2.2
 
 
+@pytest.mark.slow
 def test_noise_of_observations_does_not_lengthen_the_readout():
     """An error of 1 px moves the observed row as well. With residuals from there all readouts
     were 3 to 7 deviations too long.
@@ -129,6 +131,7 @@ def test_noise_of_observations_does_not_lengthen_the_readout():
     assert np.sqrt(np.mean(np.square(errors))) < 2
 
 
+@pytest.mark.slow
 def test_a_drone_that_turns_with_its_lines_leaves_readout_and_aspect_to_their_priors():
     problem, truth, _ = block(fixed_yaw=False)
     start = replace(truth, C=problem.C0, K=problem.K0.copy())
@@ -142,6 +145,7 @@ def test_a_drone_that_turns_with_its_lines_leaves_readout_and_aspect_to_their_pr
     assert sigma > 3 * np.sqrt(covariance(other, found).cameras[-1, -1])
 
 
+@pytest.mark.slow
 def test_turns_are_found_beside_readout():
     problem, truth, _ = block(turns=5.0, noise=0.05)
     spread = np.full(len(truth.C), np.radians(5.0) * LENS.readout)

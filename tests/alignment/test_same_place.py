@@ -78,6 +78,7 @@ def test_photos_of_one_place_count_as_one_for_every_point():
     assert total == pytest.approx(np.bincount(one.point, minlength=len(state.X)).astype(float))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("photos", [range(18), [8]], ids=["brackets", "hover"])
 def test_copies_do_not_make_a_focal_length_sharper(photos):
     copies = 2 if len(photos) > 1 else 12

@@ -30,8 +30,9 @@ def stepped(problem, state):
     return *stages.rough(problem, state, Keep(held=held)), len(names)
 
 
-@pytest.mark.parametrize("cameras", [1, pytest.param(2, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("cameras", [1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_some_photos_of_a_large_survey_tell_its_lens_first(monkeypatch, seed, cameras):
     """The whole ends where it ends without them, in fewer steps."""
     block = make_block(
@@ -146,6 +147,7 @@ def test_what_was_removed_is_not_held(monkeypatch):
     assert alive == [True, False]
 
 
+@pytest.mark.slow
 def test_what_millions_of_observations_tell_takes_little_memory():
     """Bytes for each observation of a problem of 0.4 million, beside the problem itself."""
     block = make_block(2, lines=4, per_line=8, points=1500)

@@ -38,6 +38,7 @@ def straight():
     return flown, flown.aligned()
 
 
+@pytest.mark.slow
 def test_a_turned_line_is_found(straight):
     """The same lens, poses and residuals as of a flight whose files nobody turned."""
     flown = silent(turned=LINE)
@@ -62,6 +63,7 @@ def test_files_that_were_only_rewritten_stay(straight):
     assert relative_error(flown, found) == pytest.approx(relative_error(*straight), abs=1e-9)
 
 
+@pytest.mark.slow
 def test_of_two_programs_the_one_that_turns_is_told():
     names = dict.fromkeys(LINE, "Some Viewer") | dict.fromkeys(range(3), "Some Editor")
     found = silent(names, LINE).aligned()
@@ -84,6 +86,7 @@ def test_metadata_that_are_trusted_are_not_asked():
     assert not turned_in(silent(turned=LINE).aligned(repair=False))
 
 
+@pytest.mark.slow
 def test_of_many_photos_some_tell(monkeypatch):
     monkeypatch.setattr(upside_down, "MANY", 4)
     monkeypatch.setattr(upside_down, "ASKED", 5)

@@ -150,6 +150,7 @@ def test_errors_that_repeat_at_a_mark_are_not_averaged_away():
     assert abs(many.camera.focal - CAMERA.focal) < 3 * many.sigma("focal")
 
 
+@pytest.mark.slow
 def test_a_view_of_another_board_is_a_stranger():
     seen = views(count=8)
     odd = views(count=1, seed=3)[0]

@@ -7,9 +7,8 @@ from skyquilt.simulate.board import Chessboard, tilted
 from tests.calibration.boards import BOARD, CHESS, LENS, frame, frontal, poses, to_truth, truth
 
 
-@pytest.mark.parametrize(
-    "number", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 2, 3, 4))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [0, 1, 2, 3, 4])
 def test_a_tilted_board_before_clutter_is_found_and_counted_right(number):
     pose = poses()[number]
     view = FindBoard()("", frame(pose, seed=number), BOARD)
@@ -44,6 +43,7 @@ def test_16_bit_counts_and_gaps_make_no_difference():
     assert np.abs(plain.corners - holed.corners).max() < 0.1
 
 
+@pytest.mark.slow
 def test_a_board_that_is_larger_than_said_is_refused():
     view = FindBoard()("", frame(frontal()), Board(columns=6, rows=5, square_m=0.1))
     assert not view
@@ -51,19 +51,15 @@ def test_a_board_that_is_larger_than_said_is_refused():
     assert "not corners" in view.reason
 
 
+@pytest.mark.slow
 def test_a_board_that_is_smaller_than_said_is_refused():
     view = FindBoard()("", frame(frontal()), Board(columns=8, rows=7, square_m=0.1))
     assert not view
     assert "squares were found" in view.reason
 
 
-@pytest.mark.parametrize(
-    "shift",
-    [
-        (-0.55, 0, 1.5),
-        *(pytest.param(v, marks=pytest.mark.slow) for v in ((0.5, 0.1, 1.4), (0, 0.45, 1.5))),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("shift", [(-0.55, 0, 1.5), (0.5, 0.1, 1.4), (0, 0.45, 1.5)])
 def test_a_board_half_outside_the_frame_is_refused(shift):
     view = FindBoard()("", frame(frontal(shift=shift)), BOARD)
     assert not view
@@ -80,6 +76,7 @@ def test_frames_without_a_board_are_refused_with_the_reason():
         assert "no chess pattern" in FindBoard()("", picture, BOARD).reason
 
 
+@pytest.mark.slow
 def test_two_squares_swapped_make_another_pattern():
     image = frame(frontal(), clutter=0.0)
     board = Chessboard(columns=7, rows=6)

@@ -382,6 +382,7 @@ def test_output_to_a_full_disk_gets_a_sentence(words):
     assert told.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_too_few_addresses_get_a_sentence(tmp_path):
     """With these, libraries end the process by a fault of memory in the middle of a run."""
     code, told = in_shell('ulimit -v 700000; "$@"', "mosaic", tmp_path, "-o", tmp_path / "out")

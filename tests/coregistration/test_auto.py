@@ -22,6 +22,7 @@ def auto():
     return registration_method("auto")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scale", "degrees"), [(0.85, 137.0), (1.2, -64.0)])
 def test_any_rotation_is_found_to_a_part_of_a_pixel(auto, scale, degrees):
     truth = turned(scale, degrees, SMALL, SMALL, (9.0, -14.0))
@@ -44,6 +45,7 @@ def test_the_search_alone_finds_it_too(auto):
     assert found and error(found.b_H_a, truth) < 0.5
 
 
+@pytest.mark.slow
 def test_sizes_may_differ(auto):
     truth = turned(0.55, 12.0, SHAPE, (256, 320))
     a, b = pair(truth, shape_b=(256, 320), seed=4)
@@ -86,6 +88,7 @@ def test_parts_are_found_both_ways(auto, shape):
     assert right >= 3
 
 
+@pytest.mark.slow
 def test_reversed_contrast_changes_nothing(auto):
     truth = turned(1.0, 20.0, SMALL, SMALL)
     a, _ = pair(np.eye(3), SMALL, seed=5, shape_a=SMALL)
@@ -95,6 +98,7 @@ def test_reversed_contrast_changes_nothing(auto):
     assert found and error(found.b_H_a, truth, SMALL) < 0.5
 
 
+@pytest.mark.slow
 def test_perspective_is_freed_where_the_pictures_show_it(auto):
     truth = turned(1.0, 5.0, SMALL, SMALL)
     truth[2, :2] = [1.5e-4, -1e-4]
@@ -258,7 +262,8 @@ def test_what_repeats_is_refused_and_found_where_trees_stand_off_their_rows(auto
     assert error(outcome[3.0].b_H_a, truth) < 1
 
 
-@pytest.mark.parametrize("degrees", [pytest.param(0.0, marks=pytest.mark.slow), 25.0])
+@pytest.mark.slow
+@pytest.mark.parametrize("degrees", [0.0, 25.0])
 def test_rows_of_crops_tell_no_place_along_them(auto, degrees):
     y, x = np.mgrid[:480, :640]
     across = x * np.cos(np.radians(degrees)) + y * np.sin(np.radians(degrees))

@@ -46,6 +46,7 @@ def apart_px(found: BandRig, a: BandCamera, b: BandCamera, camera_a):
     return np.linalg.norm(true - mine, axis=1)[inside]
 
 
+@pytest.mark.slow
 def test_bands_lie_on_each_other():
     """Also where the lens of the map's photos is not quite known: the band's takes that up."""
     a, b = rig(1, *SIZE, FOCAL)
@@ -59,7 +60,8 @@ def test_bands_lie_on_each_other():
     assert found.share > 0.9 and found.off_px < 0.25
 
 
-@pytest.mark.parametrize("delay_s", [pytest.param(0.0, marks=pytest.mark.slow), 0.2])
+@pytest.mark.slow
+@pytest.mark.parametrize("delay_s", [0.0, 0.2])
 def test_a_band_that_is_exposed_later_is_told_from_a_turned_one(delay_s):
     """The camera keeps its heading: on lines flown back the delay is to the other side, 8 px of
     ground at 60 m.
@@ -119,6 +121,7 @@ def test_light_beside_its_materials_does_not_move_the_thermal_camera():
     assert off[False] > 1.0 and off[True] < off[False] / 4, off
 
 
+@pytest.mark.slow
 def test_a_camera_is_found_beside_the_other_where_the_depth_changes():
     """9 cm are 0.7 to 5 px of ground at 60 to 8 m."""
     a, b = rig(1, *SIZE, FOCAL)

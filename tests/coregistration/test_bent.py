@@ -27,6 +27,7 @@ def bent(picture, share):
     return cv2.remap(picture, true[..., 0], true[..., 1], cv2.INTER_LINEAR)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.2, -0.2])
 def test_a_picture_that_a_lens_bends_is_refused_with_this_reason(share):
     a, b = pair(TRUTH, SHAPE, seed=12, shape_a=SHAPE)

@@ -49,6 +49,7 @@ def test_offsets_are_the_derivatives_of_a_homography():
         assert moved == pytest.approx(small * offsets(px, FRAME["centre"], unit)[:, :, k], abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["similarity", "homography"])
 def test_bounds_hold_for_drawn_errors(model):
     """Patches with errors of 0.7 px each (in the left half, for the similarity), and the transform

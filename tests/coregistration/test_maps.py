@@ -106,7 +106,8 @@ def test_values_of_any_type_with_stated_fillings(scene, tmp_path, kind):
         assert (raster.read(1) == stored).all()
 
 
-@pytest.mark.parametrize("kind", ["float32", pytest.param("int16", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["float32", "int16"])
 def test_fillings_that_the_file_does_not_state(scene, tmp_path, kind):
     path, b = scene
     stored, _, meant = typed(b, kind)
@@ -118,6 +119,7 @@ def test_fillings_that_the_file_does_not_state(scene, tmp_path, kind):
     assert np.nanmin(meant) <= np.nanmin(found) and np.nanmax(found) <= np.nanmax(meant)
 
 
+@pytest.mark.slow
 def test_stored_numbers_with_a_scale_become_values(scene, tmp_path):
     """They were written as they are stored, with the unit of the values."""
     path, b = scene
@@ -183,7 +185,8 @@ def mirrored(values):
     return np.ascontiguousarray(values[::-1])
 
 
-@pytest.mark.parametrize("which", ["a", pytest.param("b", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("which", ["a", "b"])
 def test_rows_from_south_to_north(scene, tmp_path, which):
     """A map whose first row is its most southern one had been compared in the mirror."""
     path, b = scene
@@ -233,7 +236,8 @@ def places_of(crs, place):
     return px, np.stack(~place @ (np.asarray(x), np.asarray(y)), 1) - 0.5
 
 
-@pytest.mark.parametrize("shift", [0.02, pytest.param(0.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("shift", [0.02, 0.0])
 def test_degrees_of_equal_size_are_not_as_wide_as_high(tmp_path, shift):
     """What QGIS and gdalwarp write in EPSG:4326: at 45 degrees a pixel is 1.4 times as high as it
     is wide. Where the place was no guess, nothing was found.
@@ -268,6 +272,7 @@ def test_maps_of_a_local_system_or_of_none(scene, tmp_path):
         assert error(np.array(record["b_H_a"]), TRUTH, SHAPE) < 0.3
 
 
+@pytest.mark.slow
 def test_control_points_in_the_file_are_its_place(scene, tmp_path):
     path, b = scene
     points = [
@@ -430,6 +435,7 @@ def test_a_photo_without_height_or_angles_lies_nowhere(scene):
         assert photo_in_map(replace(of, **less), place, 0.3) is None
 
 
+@pytest.mark.slow
 def test_a_photo_of_a_tenth_of_a_map_is_found(tmp_path):
     """It was refused: a photo shows too small a part of a map to be found without its position."""
     labels = layout(1000, 1100, seed=31)

@@ -126,9 +126,8 @@ def test_everywhere_has_the_truth_among_its_best(degrees):
     )
 
 
-@pytest.mark.parametrize(
-    "corner", [(256, 304), *(pytest.param(c, marks=pytest.mark.slow) for c in ((0, 0), (256, 0)))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("corner", [(256, 304), (0, 0), (256, 0)])
 def test_a_part_is_found_in_every_corner_of_the_whole(corner):
     """An eighth of the area, in another spectrum; the whole must lie in the plane with its rim."""
     one, other = pair(np.eye(3), seed=6)
@@ -193,6 +192,7 @@ def test_fisher_is_fishers():
     assert _fisher(np.zeros(0)) == 0
 
 
+@pytest.mark.slow
 def test_agreement_is_uniform_for_unrelated_pictures_and_large_for_related_ones():
     surprises = []
     for seed in range(7):
@@ -321,6 +321,7 @@ def crossing(seed):
     return picture
 
 
+@pytest.mark.slow
 def test_crossings_of_other_roads_confirm_nothing():
     """Patches along the two roads agree as well as those of one place; those beside them do not."""
     one, other = (np.clip(crossing(k), 0, 255).astype(np.uint8) for k in range(2))

@@ -83,6 +83,7 @@ def test_colours_that_confirm_nothing_leave_it_to_brightness():
         assert off(found) < right + 0.7
 
 
+@pytest.mark.slow
 def test_what_runs_away_is_left_where_it_was_believed():
     a, b = rough_ground(0, TRUTH)
     wrong = turned(1.0, 0.0, SHAPE, SHAPE, (9, 6))

@@ -149,6 +149,7 @@ def test_the_error_map_lies_on_a(done, files):
     assert 0 < bound[inside].min() < bound[inside].max() <= record["error_px"]
 
 
+@pytest.mark.slow
 def test_a_picture_on_itself_is_the_identity_and_said_so(files, tmp_path):
     folder, _, _ = files
     record = register(folder / "b.png", folder / "b.png", tmp_path / "out").metrics
@@ -242,6 +243,7 @@ def maps(tmp_path):
     return tmp_path, a, b, b_H_a
 
 
+@pytest.mark.slow
 def test_maps_are_registered_by_their_places_and_stay_georeferenced(maps):
     folder, a, _, b_H_a = maps
     result = register(folder / "a.tif", folder / "b.tif", folder / "out").metrics
@@ -314,6 +316,7 @@ def test_missing_files_and_words_that_are_none(files, tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_events(files, tmp_path):
     folder, _, _ = files
     cv2.imwrite(str(tmp_path / "blank.png"), np.zeros(SHAPE, np.uint8))

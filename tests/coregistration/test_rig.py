@@ -93,6 +93,7 @@ def test_no_delay_is_made_up(delay_s, headings):
     assert rig.delay_s == 0 and rig.agreeing == 10
 
 
+@pytest.mark.slow
 def test_recorded_times_of_a_camera_with_a_clock_of_its_own_are_used_where_they_are_true():
     """Each pair is late by another time; the camera turns with the lines. Times that were drawn
     apart from the pictures change nothing.

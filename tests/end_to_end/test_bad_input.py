@@ -112,6 +112,7 @@ def renamed_text(path: Path) -> None:
     path.write_text("these are no pixels\n" * 100)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("spoil", "reason"),
     [
@@ -339,6 +340,7 @@ def unrelated(photos: Path) -> tuple[Path, Path]:
     return a, b
 
 
+@pytest.mark.slow
 def test_two_photos_without_overlap_lie_where_they_say(mosaic, photos):
     unrelated(photos)
     told = mosaic(photos).made()
@@ -347,6 +349,7 @@ def test_two_photos_without_overlap_lie_where_they_say(mosaic, photos):
     assert "no two photos could be linked" in told.metrics["why"]
 
 
+@pytest.mark.slow
 def test_two_photos_without_overlap_or_positions(mosaic, photos):
     for path in unrelated(photos):
         relabel(path, strip=True)
@@ -406,6 +409,7 @@ def test_gps_of_one_photo_400_m_away(mosaic, photos):
     assert told.metrics["blocks"] == [9]
 
 
+@pytest.mark.slow
 def test_gps_of_one_of_two_photos_300_km_away(mosaic, photos):
     _, b = keep(photos, 0, 1)
     relabel(b, place=(49.3, 14.3))

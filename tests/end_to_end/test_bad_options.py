@@ -163,7 +163,7 @@ def test_bounds_that_cut_the_map(mosaic, flight, finished):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("side", [pytest.param(0.1, marks=pytest.mark.slow), 1.0])
+@pytest.mark.parametrize("side", [0.1, 1.0])
 def test_bounds_of_some_pixels(mosaic, flight, finished, side):
     """Most photos show none of so small a map."""
     with rasterio.open(finished / "mosaic.tif") as whole:
@@ -271,6 +271,7 @@ def test_a_boundary_without_positions(mosaic, photos, tmp_path):
 # ways of telling
 
 
+@pytest.mark.slow
 def test_json_is_one_object_per_line(mosaic, photos):
     keep(photos, 0, 1, 2)
     told = mosaic(photos, "--json").made()

@@ -38,12 +38,8 @@ def solved(told):
     return {s["properties"]["filename"]: np.array(s["properties"]["translation"]) for s in shots}
 
 
-LONG = ("hybrid", "flightline", "image", "position")
-
-
-@pytest.mark.parametrize(
-    "method", [pytest.param(m, marks=pytest.mark.slow) if m in LONG else m for m in METHODS]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("method", METHODS)
 def test_every_method_makes_a_map(mosaic, lines, method):
     told = mosaic(lines / "photos", "--method", method).made()
     m, q = told.metrics, told.metrics["quality"]
@@ -129,6 +125,7 @@ def test_known_distances_are_measured_on_the_map(mosaic, lines, tmp_path):
     assert q["lambda"] == pytest.approx((q["lambda_spat"] + q["lambda_corr"]) / 2, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_where_photos_do_not_overlap_a_new_piece_begins_and_is_said(mosaic, photos):
     keep(photos, 0, 1, 2, 3, 5)
     told = mosaic(photos, "--method", "image").made()

@@ -152,6 +152,7 @@ def test_results_that_may_not_be_replaced(mosaic, flight, small_disk):
     remount(disk, "rw")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", ["700k", *map(late, ("8k", "100k", "1200k", "1600k", "2m"))])
 def test_a_full_disk(mosaic, flight, small_disk, finished, size):
     """Wherever it fills up: a sentence, no half file, and with more room the same command goes

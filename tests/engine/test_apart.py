@@ -21,6 +21,7 @@ def all_of(steps):
             return yielded, stop.value
 
 
+@pytest.mark.slow
 def test_parts_are_told_while_the_work_goes_on():
     """Each is seen before the next one begins."""
     seen = threading.Event()

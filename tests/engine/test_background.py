@@ -51,6 +51,7 @@ def gone(pid):
         return True
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="processes are looked up in /proc")
 def test_it_ends_with_the_program_that_started_it():
     """However that ends."""

@@ -104,6 +104,7 @@ def test_torn_bytes_are_a_value_error(leaf, data):
         decode(torn, REGISTRY)
 
 
+@pytest.mark.slow
 @settings(max_examples=120, deadline=None)
 @given(LEAVES, st.data())
 def test_changed_bytes_are_a_value_error_or_a_value(leaf, data):

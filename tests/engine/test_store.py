@@ -146,6 +146,7 @@ def test_two_processes_may_make_the_same_result(store, monkeypatch):
     assert not list(store.folder.rglob("*.partial"))
 
 
+@pytest.mark.slow
 def test_threads_that_make_the_same_do_not_take_it_from_one_another(store):
     """Eight threads store one key at a time, a hundred times."""
     meet = threading.Barrier(8, timeout=30)

@@ -16,6 +16,7 @@ def shares(large, small):
     return np.clip(np.minimum(high, at + 1) - np.maximum(low, at), 0, 1) * small / large
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bands", [1, 3, 4, 5, 10])
 @pytest.mark.parametrize("size", [(40, 24), (50, 31), (38, 21)])
 def test_every_band_is_averaged_by_itself(bands, size):

@@ -72,6 +72,7 @@ def test_noise_makes_errors_that_are_neither_too_large_nor_too_small():
     assert (error > 1).mean() < 0.01
 
 
+@pytest.mark.slow
 @settings(max_examples=12, deadline=None)
 @given(seed=st.integers(0, 1000), gain=st.floats(0.2, 5), offset=st.floats(-500, 500))
 def test_gain_and_offset_change_nothing_and_exchange_negates(seed, gain, offset):
@@ -156,6 +157,7 @@ def test_three_hundred_pairs_cost_little():
     assert time.process_time() - start < 0.6  # 0.1 s on a quiet machine
 
 
+@pytest.mark.slow
 @pytest.mark.real
 @pytest.mark.skipif(not REAL.exists(), reason="the real survey is not beside the checkout")
 def test_unrelated_real_patches_are_refused_and_real_shifts_found():

@@ -135,6 +135,7 @@ def test_killed_while_it_is_begun_again(flight, tmp_path):
         same(replay(tmp_path / f"{k}", inbox), undisturbed)
 
 
+@pytest.mark.slow
 def test_without_any_position_it_is_said_once_and_the_final_map_breaks_no_page(flight, tmp_path):
     """The final map has no place, so no layer can show it; its files are there."""
     photos = []

@@ -66,6 +66,7 @@ def test_layers_of_gis_programs_are_taken_from_their_content(tmp_path):
         assert len(site.web.get("/layers").json()["layers"]) == 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "data", "reason"),
     [

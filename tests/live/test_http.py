@@ -147,6 +147,7 @@ def recorded():
     return groups
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("version", "crs"), list(recorded()))
 def test_the_requests_of_a_real_qgis(site, version, crs):
     """Replayed with this map's extent in place of the one that was recorded; closer views show a

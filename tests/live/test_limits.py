@@ -175,6 +175,7 @@ def test_odd_numbers_of_events_are_ignored(site):
         assert answer.status_code == 200
 
 
+@pytest.mark.slow
 def test_photos_are_shown_only_with_the_content_of_the_run(tmp_path):
     photos = tmp_path / "photos"
     run = made_run(tmp_path, photos)
@@ -321,6 +322,7 @@ def opened(port, data=b"GET /info HTTP/1.1\r\nHost: 127.0.0.1\r\n"):
     return one
 
 
+@pytest.mark.slow
 def test_half_sent_headers_keep_nobody_out(run, monkeypatch):
     monkeypatch.setattr(connections, "HEADER_S", 1.0)
     guard = Guard(token="looking-only", most_connections=40)

@@ -303,6 +303,7 @@ def test_uploads_that_nobody_goes_on_with_expire_while_the_server_runs(tmp_path)
         assert client.ask("HEAD", place).status_code == 404
 
 
+@pytest.mark.slow
 def test_idle_uploads_do_not_keep_others_out(tmp_path):
     with served(tmp_path / "out", QUICK, guard=Guard(most_uploads=2, upload_idle_s=1.0)) as site:
         client = Client(site.web)
@@ -328,6 +329,7 @@ def test_only_those_who_may_write_upload(tmp_path):
         assert Client(site.web).offset(place) == 0
 
 
+@pytest.mark.slow
 def test_a_server_that_ends_keeps_the_bytes_that_arrived(flight, tmp_path, caplog):
     """Without a traceback; the upload goes on when it is back."""
     data = flight.photos[0].read_bytes()

@@ -74,6 +74,7 @@ def test_photos_handed_to_it_are_mapped_and_it_comes_back_when_killed(flight, tm
     live.close()
 
 
+@pytest.mark.slow
 def test_an_address_that_is_taken_and_a_base_that_is_no_map_are_told(tmp_path):
     live = LiveMap(tmp_path / "out", LiveSettings())
     (tmp_path / "no.tif").write_bytes(b"no map")

@@ -99,6 +99,7 @@ def test_a_kept_file_that_is_written_anew_replaces_the_former(flight, tmp_path):
     live.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tone", [3, 252])
 def test_a_photo_of_one_tone_is_no_part_of_the_map(flight, tmp_path, tone):
     """A lens cap with a position would be drawn as a hole in the map."""

@@ -39,6 +39,7 @@ def photos(site, start, seconds=120):
     raise AssertionError("no frames")
 
 
+@pytest.mark.slow
 def test_a_video_in_one_request_and_its_telemetry(site, film):
     sent = {"name": "A.SRT", "source": "mini"}
     answer = site.web.post("/photos", params=sent, content=film.with_suffix(".SRT").read_bytes())
@@ -54,6 +55,7 @@ def test_a_video_in_one_request_and_its_telemetry(site, film):
     assert list((site.folder / "uploads").glob("*.part")) == []
 
 
+@pytest.mark.slow
 def test_a_video_in_parts_whatever_its_name(site, film, monkeypatch):
     monkeypatch.setattr(uploaded_clips, "PATIENCE_S", 0.0)
     data = film.read_bytes() + b"\0" * 16  # another file

@@ -41,6 +41,7 @@ def marks_in(pictures, cameras=None):
     return features, FindFixedMarks()(features, cameras, [(WIDE, HIGH)] * len(pictures))
 
 
+@pytest.mark.slow
 def test_a_text_is_found_and_nothing_beside_it():
     features, marks = marks_in([stamped(p) for p in flight(8)])
     left, top, right, bottom = STAMP
@@ -72,6 +73,7 @@ def test_many_lines_of_text_are_no_camera_that_stands_still(rows):
     assert not marks.on_mark("cam", np.array([[240.0, 180.0], [100.0, 200.0]])).any()
 
 
+@pytest.mark.slow
 def test_texts_that_change_in_part_are_found_where_they_do_not():
     _, marks = marks_in([stamped(p, f"CAM 10:3{i}") for i, p in enumerate(flight(8))])
     assert marks.on_mark("cam", np.array([[30.0, 252.0]])).all()
@@ -108,11 +110,13 @@ def hovering(flown, still, seed):
     return [*flown[:at], *shots, *flown[at:]]
 
 
-@pytest.mark.parametrize(("still", "seed"), [(8, 0), pytest.param(16, 1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("still", "seed"), [(8, 0), (16, 1)])
 def test_a_hover_within_a_flight_shows_no_marks(still, seed):
     assert not marks_in(hovering(flight(8, seed=seed), still, seed))[1].masks
 
 
+@pytest.mark.slow
 def test_a_text_is_found_though_the_drone_hovered():
     pictures = [stamped(p) for p in hovering(flight(9), 6, 0)]
     features, marks = marks_in(pictures)
@@ -124,6 +128,7 @@ def test_a_text_is_found_though_the_drone_hovered():
     assert not found[y < top - 20].any()
 
 
+@pytest.mark.slow
 def test_every_camera_has_its_own_marks():
     plain, marked = flight(8), [stamped(p) for p in flight(8, seed=5)]
     _, marks = marks_in([*plain, *marked], ["plain"] * 8 + ["marked"] * 8)

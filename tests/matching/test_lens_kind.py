@@ -66,7 +66,8 @@ def judge(reported, features, matches):
     return found, len(links)
 
 
-@pytest.mark.parametrize("relief", [6.0, pytest.param(0.5, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("relief", [6.0, 0.5])
 @pytest.mark.parametrize(
     ("focal", "reported"), [(730.0, 730.0), (560.0, 520.0), (560.0, 900.0), (640.0, 560.0)]
 )
@@ -79,7 +80,8 @@ def test_a_fisheye_is_found_by_its_matches(focal, reported, relief):
     assert 0.6 < found["one"].focal / focal < 1.45
 
 
-@pytest.mark.parametrize("relief", [6.0, pytest.param(0.5, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("relief", [6.0, 0.5])
 @pytest.mark.parametrize(
     ("focal", "k1"), [(900.0, 0.0), (900.0, -0.12), (560.0, 0.02), (700.0, 0.1)]
 )

@@ -68,6 +68,7 @@ def shared(a, b, camera):
     return link if isinstance(link, Link) else None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turned_deg", [0.0, 140.0])
 def test_photos_that_share_their_rims_are_linked_where_plain_pictures_are_not(ground, turned_deg):
     """160 px above the ground and 300 px apart: what lies 62 degrees from one axis, or less, lies

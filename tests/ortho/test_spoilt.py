@@ -119,6 +119,7 @@ def pictures(alignment, ground=None):
     return {i: np.rint(np.dstack([g] * 3)).astype(np.uint8) for i, g in grey.items()}
 
 
+@pytest.mark.slow
 def test_dust_yields_where_all_photos_show_it():
     """Two discs of 30 and 22 px (of 400 x 300), 30 and 20 % darker, in all photos but at no place
     of the ground: they are found, and little else of the picture.
@@ -162,6 +163,7 @@ def test_a_cross_and_a_scale_yield_though_they_have_few_features():
     assert len(notes) == 1 and "on 1.4 % of it" in notes[0] and "a cross, a scale" in notes[0]
 
 
+@pytest.mark.slow
 def test_a_road_that_the_drone_follows_is_no_mark():
     """It hardly varies while the fields beside it do, but other photos show it, too."""
     ground = textured().copy()

@@ -215,6 +215,7 @@ def test_beyond_the_support_lies_the_plane():
     assert np.abs(np.diff(out[20:180, 100:], axis=1)).max() < 0.3
 
 
+@pytest.mark.slow
 def test_far_from_the_support_other_heights_are_taken(monkeypatch):
     """The plane of before next to the support, other heights far away, and a plane fitted to these
     where they are worth nothing; never the slope continued to the rim.
@@ -344,6 +345,7 @@ def test_specks_found_in_bands_are_those_found_at_once(monkeypatch):
         assert np.array_equal(whole[z == 0], (size > least)[label[z == 0]])
 
 
+@pytest.mark.slow
 def test_crowns_levelled_in_bands_are_those_levelled_at_once(monkeypatch):
     """And leaves of which little is known become level, up to the cliff at their rim."""
     rng = np.random.default_rng(4)

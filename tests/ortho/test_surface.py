@@ -244,6 +244,7 @@ def test_heights_on_a_raster_are_those_at_its_places():
     assert surface.on(x, y[:0]).shape == (0, len(x))
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 10**6))
 def test_at_steps_heights_are_those_of_one_side(seed):
@@ -293,7 +294,8 @@ def test_edges_run_straight_through_the_staircase_of_cells(turn_deg):
         assert off[0] < 0.75 * off[1] and wrong.mean() < 0.7 * stairs.mean()
 
 
-@pytest.mark.parametrize("along", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("along", [0, 1])
 def test_the_heights_of_a_long_corridor_stay_within_what_opencv_takes(along):
     """30 km of railway, points every half metre."""
     rng = np.random.default_rng(4)

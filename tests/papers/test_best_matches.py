@@ -113,6 +113,7 @@ def test_nothing_and_kinds():
         Guided()(some, some, np.zeros((2, 2)))
 
 
+@pytest.mark.slow
 def test_sift_all_keeps_the_strongest_wherever_they_are():
     """Against OpenCV's own detector; `sift` takes the strongest of each of 100 cells."""
     rng = np.random.default_rng(0)

@@ -81,6 +81,7 @@ def test_a_start_brings_the_refinements_near():
     assert not Ecc()(a, b) or error(Ecc()(a, b), H) > 50  # and without it they cannot
 
 
+@pytest.mark.slow
 def test_mutual_information_where_correlation_fails():
     """Bright and dark of one are dark in the other, grey is bright: no correlation, but much in
     common.

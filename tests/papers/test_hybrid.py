@@ -126,11 +126,8 @@ def run(flight, **more):
     )
 
 
-@pytest.mark.parametrize(
-    "optimise",
-    [pytest.param(OPTIMISERS[0], marks=pytest.mark.slow), OPTIMISERS[1]],
-    ids=("anneal", "surfaces"),
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("optimise", [OPTIMISERS[0], OPTIMISERS[1]], ids=("anneal", "surfaces"))
 def test_a_noisy_strip_becomes_a_strip(optimise):
     flight = fly(line(8, step=20.0, heading=60.0), yaw=60.0, gps=1.5, yaw_error=2.0, seed=3)
     found = run(flight, optimise=optimise)
@@ -168,6 +165,7 @@ def test_the_loop_closes_without_any_global_optimisation():
     assert np.hypot(*error) < 0.5
 
 
+@pytest.mark.slow
 def test_a_survey_of_lines_keeps_its_distances():
     flight = fly(lawn(3, 4, step=20.0, apart=30.0), gps=1.0, seed=8)
     found = run(flight)

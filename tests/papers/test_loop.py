@@ -22,6 +22,7 @@ def rectangle():
     return np.concatenate(sides)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "left"), [("similarity", 0.5), ("homography", 0.85)])
 def test_a_loop_is_closed(model, left):
     """Similarities on top of a chain of homographies leave their bending as it is."""
@@ -32,6 +33,7 @@ def test_a_loop_is_closed(model, left):
     assert any("closings of loops" in n for n in shut.notes)
 
 
+@pytest.mark.slow
 def test_lines_side_by_side_are_loops_too():
     flight = fly(lawn(3, 8), noise_px=0.6, points=8000)
     open_, shut = (run(flight, replace(chain(), loop=way)) for way in (False, True))

@@ -86,9 +86,8 @@ def test_a_picture_without_edges_has_none():
     assert not binary_edges(gradient_magnitude(np.full((20, 20), 7, np.uint8)), 0.2).any()
 
 
-@pytest.mark.parametrize(
-    "method", ["usurf", pytest.param("surf+rfae", marks=pytest.mark.slow), "structure"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["usurf", "surf+rfae", "structure"])
 def test_methods_register_what_they_are_made_for(method, alike):
     a, b, truth = alike
     found = registration_method(method)(Picture(values=a), Picture(values=b))
@@ -172,6 +171,7 @@ def test_other_lobes_register_what_lobe_1_does_not_and_the_first_octave_hardly_m
     assert not asked
 
 
+@pytest.mark.slow
 def test_what_patches_do_not_confirm_is_refused():
     """Nine inliers of a method, but pictures of nothing in common."""
     rng = np.random.default_rng(2)

@@ -108,6 +108,7 @@ def test_refusals(tmp_path, finished):
     assert not (tmp_path / "n" / "strip.json").exists()
 
 
+@pytest.mark.slow
 def test_a_board_gives_the_camera_back():
     """Without noise the full model is found exactly; lower orders are other fits, not the same with
     terms left out.

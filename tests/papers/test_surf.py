@@ -168,6 +168,7 @@ def test_known_warps(picture, angle, scale, blur, repeated, matched):
     assert found[0] > repeated and found[1] > matched and found[2] > 0.7, found
 
 
+@pytest.mark.slow
 def test_upright_is_better_where_nothing_turns_and_worse_where_much_does(picture):
     plain, upright = Surf(count=800), Surf(count=800, upright=True)
     assert scores(upright, picture, 0, 0.8)[1] > scores(plain, picture, 0, 0.8)[1]

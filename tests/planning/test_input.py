@@ -291,6 +291,7 @@ def test_what_a_run_misses_is_its_hole(tmp_path):
         missing_site(tmp_path / "..", 1)
 
 
+@pytest.mark.slow
 def test_the_command_plans_and_checks(tmp_path):
     out = tmp_path / "out"
     words = ["plan", str(area(tmp_path)), "-o", str(out), "--camera", "FC6310", "--height", "100",
@@ -309,6 +310,7 @@ def test_the_command_plans_and_checks(tmp_path):
     assert "http://" not in page and "https://" not in page and "Least views" in page
 
 
+@pytest.mark.slow
 def test_the_command_ends_with_one_sentence(tmp_path):
     words = ["plan", str(area(tmp_path)), "-o", str(tmp_path / "o"), "--height", "50"]
     code = "import sys; from skyquilt.cli.main import run; sys.argv = sys.argv[1:]; run()"

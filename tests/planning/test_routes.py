@@ -116,6 +116,7 @@ def test_what_several_drones_must_visit_they_fly_to():
     assert bound <= 62 * 10 / 2 + 2 * there + 30 * 40 / 8
 
 
+@pytest.mark.slow
 def test_routes_visit_every_point_once_clear_of_keep_outs_and_near_the_bound():
     points = [p for p in grid(10, 6) if not box(95, 35, 145, 105).intersects(Point(p.x, p.y))]
     closed = KeepOut(shape=box(105, 45, 135, 95))
@@ -132,6 +133,7 @@ def test_routes_visit_every_point_once_clear_of_keep_outs_and_near_the_bound():
     assert nearest(a, b) >= QUICK.separation_m
 
 
+@pytest.mark.slow
 def test_where_one_charge_does_not_suffice_there_are_more_sorties():
     drones = fleet(1, endurance_s=260.0, reserve=0.25, swap_s=100.0)
     site = make_site(box(0, 0, 270, 150), (), ZONE)
@@ -228,6 +230,7 @@ def test_a_fixed_wing_turns_within_its_radius_and_keeps_clear():
     assert sortie.seconds > straight.sorties[0].seconds + 10
 
 
+@pytest.mark.slow
 def test_a_turn_that_does_not_fit_between_keep_outs_is_told():
     walls = box(-300, -50, 570, 400).difference(box(-15, -50, 285, 105))
     site = make_site(box(0, 0, 270, 90), (KeepOut(shape=walls),), ZONE)
@@ -256,6 +259,7 @@ def test_ways_rise_over_obstacles_by_the_upper_hull():
     assert height.max() < 91 and 3 <= len(way) <= 6
 
 
+@pytest.mark.slow
 def test_drones_from_one_place_take_off_one_after_the_other():
     drones = [Drone(name=n, start=(0, -40), landing=(0, -40), view=VIEW) for n in "ab"]
     site = make_site(box(0, 0, 270, 150), (), ZONE)
@@ -272,6 +276,7 @@ def test_without_or_tools_a_sentence_says_what_to_install(monkeypatch):
         plan_routes(site, grid(3, 3), fleet(1), QUICK, FLAT, 60.0)
 
 
+@pytest.mark.slow
 def test_an_interrupt_ends_the_search():
     """OR-tools loses what is raised in functions that it calls: Ctrl-C did nothing."""
     places = np.random.default_rng(3).uniform(0, 1000, (60, 2))

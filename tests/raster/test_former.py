@@ -16,6 +16,7 @@ KINDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_raster_that_grows_keeps_its_tiles_bit_for_bit(tmp_path, kind):
     options, dtype = KINDS[kind]

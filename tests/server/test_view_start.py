@@ -47,6 +47,7 @@ def cpu_s_to_first_answer(output, said):
     return sum(map(int, words[11:13])) / os.sysconf("SC_CLK_TCK")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="CPU times are read from /proc")
 def test_the_first_answer_waits_for_nothing_it_does_not_need(finished, tmp_path):
     said = tmp_path / "imports.txt"

@@ -158,6 +158,7 @@ def test_a_folder_that_cannot_be_made_is_refused_in_plain_words(tmp_path, name):
         next(simulate(settings(thermal=None, route=Route(photos=2)), tmp_path / name))
 
 
+@pytest.mark.slow
 def test_command_with_every_option(tmp_path):
     words = """--preset demo --photos 6 --overlap 70 --sidelap 50 --height 70 --heading 75
     --size 240x180 --gps-noise 1 --gps-missing 1 --yaw-lie tag --altitude-drift 20 --focal-error 2

@@ -77,6 +77,7 @@ PX = np.array([[150.0, 150.0], [650.0, 150.0], [150.0, 650.0], [400.0, 400.0]])
 THERE = (PX - 20.0 - 0.5) / 2  # px of the thermal map: its content begins 20 px into the visual map
 
 
+@pytest.mark.slow
 def test_the_join_closes_what_positions_leave_open(maps, tmp_path):
     a, b = maps
     joined = join(a, b, (tmp_path / "no", tmp_path / "no"), "maps")

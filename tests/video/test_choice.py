@@ -142,6 +142,7 @@ def told(film, folder, first_s, rows):
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("first_s", "rows", "source", "offset_s"),
     [

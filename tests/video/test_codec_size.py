@@ -126,14 +126,8 @@ def test_jpegs_larger_than_avi_and_matroska_say_allocate_nothing(tmp_path, endin
     assert told.stderr == ""
 
 
-@pytest.mark.parametrize(
-    ("ending", "fourcc"),
-    [
-        ("avi", "XVID"),
-        pytest.param("mkv", "mp4v", marks=pytest.mark.slow),
-        pytest.param("mts", "mp4v", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("ending", "fourcc"), [("avi", "XVID"), ("mkv", "mp4v"), ("mts", "mp4v")])
 def test_frames_larger_than_the_container_says_are_refused(tmp_path, ending, fourcc):
     side = 7104
     frame = np.full((side, side, 3), 90, np.uint8)

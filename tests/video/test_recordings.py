@@ -26,7 +26,8 @@ def frames_of(source, store):
     return result_of(with_frames(read_input(source, InputSettings()), InputSettings(), store))
 
 
-@pytest.mark.parametrize("fps", [24.0, 30000 / 1001, pytest.param(60.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("fps", [24.0, 30000 / 1001, 60.0])
 def test_the_same_flight_at_any_frame_rate_gives_the_same_frames(tmp_path, fps):
     seconds = 7
     along = np.arange(round(seconds * fps)) / fps * SPEED
@@ -103,6 +104,7 @@ def test_clips_of_a_moment_have_positions_too(tmp_path, count):
     assert all(p.position is not None for p in found.survey.photos)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ending", "fourcc", "size"),
     [

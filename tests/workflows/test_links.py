@@ -105,6 +105,7 @@ def looked_for(maps, reach=2, rounds=4, xy=None):
     return pairs, {(k.a, k.b) for k in tried if isinstance(k, Link)}
 
 
+@pytest.mark.slow
 def test_photos_that_look_to_all_sides_are_compared_with_what_they_share():
     """Neighbours in the order of capture hardly connect them; their true overlaps do."""
     maps = flown(24, 5, spread=60.0)
