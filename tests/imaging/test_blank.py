@@ -67,6 +67,37 @@ def test_dark_ground_is_no_rim(kind):
         assert blank_rim([noisy(p, i) for i, p in enumerate(pictures)]) is None
 
 
+@pytest.mark.parametrize("level", [255, 128, 40])
+@pytest.mark.parametrize("shape", ["circle", "bars", "corner"])
+def test_frames_of_one_colour_are_found_where_they_were_drawn(shape, level):
+    keep = shown(shape)
+    pictures = []
+    for p in ground():
+        framed = cv2.resize(np.where(keep, p, level), None, fx=3, fy=3).astype(np.uint8)
+        packed = cv2.imencode(".jpg", framed, [cv2.IMWRITE_JPEG_QUALITY, 60])[1]
+        unpacked = cv2.imdecode(packed, cv2.IMREAD_GRAYSCALE)
+        pictures.append(cv2.resize(unpacked, (WIDE, HIGH), interpolation=cv2.INTER_AREA))
+    mask = blank_rim(pictures)
+    assert mask is not None and (mask == ~keep).mean() > 0.98
+    assert blank_rim([p.astype(np.uint8) for p in ground()]) is None
+
+
+@pytest.mark.parametrize("kind", ["canal", "snow", "exposures"])
+def test_even_ground_is_no_frame(kind):
+    """A canal or a road at one place of every picture has some texture, or is lighter in one
+    picture; snow is white where others are not.
+    """
+    pictures, side = ground(), np.mgrid[:HIGH, :WIDE][1] < 50
+    if kind == "snow":
+        pictures = [np.where(away(20 + 30 * i, 60) < 150, p, 255.0) for i, p in enumerate(pictures)]
+    even = cv2.resize(np.random.default_rng(5).uniform(-8, 8, (12, 16)), (WIDE, HIGH))
+    if kind == "canal":
+        pictures = [np.where(side, 60 + even, p) for p in pictures]
+    if kind == "exposures":
+        pictures = [np.where(side, 120 + 3 * i, p) for i, p in enumerate(pictures)]
+    assert blank_rim([np.round(p).astype(np.uint8) for p in pictures]) is None
+
+
 def test_a_see_through_photo_tells_for_itself():
     pictures, keep = ground(2), [away(0, 0) > 60, away(255, 0) > 90]
     cameras = dict.fromkeys(range(2), ("c", (4 * WIDE, 4 * HIGH)))

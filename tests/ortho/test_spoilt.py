@@ -3,6 +3,7 @@
 import io
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import piexif
 import pytest
@@ -24,10 +25,10 @@ from tests.ortho.scenes import photograph, textured
 from tests.ortho.test_sharpness import flight, seen
 
 
-def shown(alignment, thumbnails, fixed=None):
+def shown(alignment, thumbnails, fixed=None, grey=None):
     details = seen(alignment)
     names = [f"{k}.jpg" for k in range(len(details))]
-    return spoilt_parts(alignment, lambda k: details[k], thumbnails, names, fixed or {})
+    return spoilt_parts(alignment, lambda k: details[k], thumbnails, names, fixed or {}, grey=grey)
 
 
 def plain(count):
@@ -161,6 +162,25 @@ def test_a_cross_and_a_scale_yield_though_they_have_few_features():
     assert yields[changed].all()
     assert (yields & ~changed).mean() < 0.015  # a margin of a few px
     assert len(notes) == 1 and "on 1.4 % of it" in notes[0] and "a cross, a scale" in notes[0]
+
+
+def test_thin_lines_yield_where_features_at_their_ends_tell_of_marks():
+    alignment = flight(12, apart=6.0)
+    lines, ends = np.zeros((300, 400), bool), np.zeros((75, 100), bool)
+    lines[150, 100:300] = lines[60:240, 200] = True
+    ends[37, [25, 74]] = ends[[15, 59], 50] = True
+    full = pictures(alignment)
+    for picture in full.values():
+        picture[lines] = 255
+    small = {i: cv2.resize(p, (100, 75), interpolation=cv2.INTER_AREA) for i, p in full.items()}
+    fixed = dict.fromkeys(full, around(ends, (400, 300)))
+    marks, notes = shown(alignment, small, fixed)
+    v, u = np.mgrid[:300, :400]
+    assert notes == () and (marks[3].at(u, v) < 0)[lines].mean() < 0.5  # what was known
+    marks, notes = shown(alignment, small, fixed, lambda i, longest: full[i][..., 0])
+    yields = marks[3].at(u, v) < 0
+    assert yields[lines].all() and (yields & ~lines).mean() < 0.06  # 1.5 px of a thumbnail
+    assert len(notes) == 1 and "a cross, a scale" in notes[0]
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """Parts of pictures along their rim that show nothing, so that they are not drawn: black corners of
-a circular fisheye or of photos that a program undistorted, bars, and see-through pixels.
+a circular fisheye or of photos that a program undistorted, bars, frames of one colour, and
+see-through pixels.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -16,13 +17,17 @@ LONGEST = 256
 """Longest side in px of the pictures that are compared."""
 BLACK = 12
 """Level of 255 up to which a picture shows nothing, in every photo of the camera."""
+EVEN, NEARLY, MOSTLY = 3, 12, 0.8
+"""A frame of one colour is even to so many levels of 255 over all photos, within this share of it
+at least; where compression has left something of the picture beside it, it is so nearly.
+"""
 EMPTY = 4
 """The same level of a see-through photo, whose empty pixels are 0 before contrast is stretched."""
 LEAST, MOST = 0.002, 0.7
 """Shares of a picture that may show nothing; less is noise, more is a picture of the night."""
 STEP, BESIDE = 25, 4
-"""So much lighter the pictures are within so many px beside it, in the median: dark corners of a
-lens rise slowly.
+"""By so many levels the pictures differ from it within so many px beside it, in the median: dark
+corners of a lens rise slowly.
 """
 WIDER = 1.5
 """Width in px of the strip beside it that is not drawn either, since it is mixed with black."""
@@ -88,7 +93,8 @@ def find_blanks(
             share = 100 * float(np.median([m.mean() for m in masks.values()]))
             notes.append(
                 f"{len(masks)} photos of {name} show nothing on {share:.1f} % of the picture, along"
-                " its rim (black corners or bars, or see-through pixels): that is not drawn."
+                " its rim (black corners or bars, a frame, or see-through pixels): that is not"
+                " drawn."
             )
     return found, tuple(notes)
 
@@ -123,14 +129,34 @@ def joined(a: Blank, b: Blank) -> Blank:
 
 def blank_rim(pictures: Sequence[NDArray[np.uint8]]) -> Mask | None:
     """Where none of some pictures (h, w) of one camera shows anything; None where all do."""
-    lightest = np.max(pictures, axis=0)
-    mask = _rim(lightest <= BLACK)
-    if not LEAST < mask.mean() < MOST:
-        return None
-    away = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    beside = (away > WIDER) & (away <= BESIDE)
-    steps = [float(np.median(p[beside]) - np.median(p[mask])) for p in pictures]
-    return mask if np.median(steps) >= STEP else None
+    lightest, darkest = np.max(pictures, axis=0), np.min(pictures, axis=0)
+    for mask in (_rim(lightest <= BLACK), _frame(lightest.astype(int), darkest.astype(int))):
+        if not LEAST < mask.mean() < MOST:
+            continue
+        away = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        beside = (away > WIDER) & (away <= BESIDE)
+        steps = [np.median(np.abs(p[beside] - float(np.median(p[mask])))) for p in pictures]
+        if np.median(steps) >= STEP:
+            return mask
+    return None
+
+
+def _frame(lightest: NDArray[Any], darkest: NDArray[Any]) -> Mask:
+    """The parts along the rim that have one level in all pictures, from the largest and the least
+    value (h, w) of each pixel. Ground that is even at one place of every picture (a canal beside
+    the line of flight) differs by more.
+    """
+    even = lightest - darkest <= EVEN
+    at_rim = np.ones(even.shape, bool)
+    at_rim[1:-1, 1:-1] = False
+    if not (at_rim & even).any():
+        return np.zeros(even.shape, bool)
+    level = int(np.bincount(darkest[at_rim & even]).argmax())
+    nearly = (lightest <= level + NEARLY) & (darkest >= level - NEARLY)
+    _, label = cv2.connectedComponents(nearly.astype(np.uint8), connectivity=4)
+    same = (lightest <= level + EVEN) & (darkest >= level - EVEN)
+    share = np.bincount(label[same], minlength=label.max() + 1) / np.bincount(label.ravel())
+    return np.asarray(np.isin(label, [k for k in rim_labels(label) if share[k] >= MOSTLY]))
 
 
 def rim_labels(label: NDArray[Any]) -> NDArray[Any]:

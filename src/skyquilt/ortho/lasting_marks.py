@@ -7,7 +7,7 @@ Marks without features, such as the even bar of a scale, are found so, too
 that is alike in all pictures (a road that the drone follows): they show something else there.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import cv2
@@ -41,6 +41,10 @@ BESIDE = 3
 """Width in px of a reduced picture of the strip around a mark that is compared with it."""
 ASKED, POINTS = 10, 40
 """Photos whose ground is sought in others, and most pixels of a mark, or beside it, in each."""
+FINE = 1024
+"""Longest side in px of the pictures that are compared where photos show other marks: thumbnails
+do not tell the thin lines of a cross-hair or a scale, between features at their ends.
+"""
 OTHER = 1.5
 """What others show in place of a mark differs from it by so many times more than beside it."""
 Mask = NDArray[np.bool_]
@@ -53,12 +57,13 @@ def find_lasting_marks(
     thumbnails: Mapping[int, NDArray[Any]],
     flat: Surface,
     fixed: Mapping[int, Blank],
+    grey: Callable[[int, int], Grey] | None = None,
 ) -> tuple[dict[str, Blank], tuple[str, ...]]:
     """Where the pictures of each camera show marks, only of cameras with marks, and notes.
 
     `views` of level ground, `flat`, from places apart, and the name (n) of the camera of each;
     `thumbnails`: (h, w[, bands]) of their photos, of 8 bits; `fixed`: marks of photos known before,
-    by index.
+    by index; `grey`: the picture (h, w) of a photo (index), its longer side of so many px.
     """
     found, notes = dict[str, Blank](), list[str]()
     for name in dict.fromkeys(names):
@@ -66,16 +71,20 @@ def find_lasting_marks(
         if len(own) < FEWEST:
             continue
         some = [own[k] for k in evenly(len(own), LOOKED_AT)]
-        pictures = np.stack([to_grey8(thumbnails[v.photo]) for v in some])
+        small = thumbnails[own[0].photo].shape[:2]
+        known = fixed.get(own[0].photo)
+        if known is None or grey is None:
+            pictures = np.stack([to_grey8(thumbnails[v.photo]) for v in some])
+        else:
+            pictures = np.stack([grey(v.photo, FINE) for v in some])
         label = _hardly_varying(pictures)
         marks = [k for k in range(1, label.max() + 1) if _is_mark(label, k, some, pictures, flat)]
         mask = np.isin(label, marks)
         size = own[0].camera.width, own[0].camera.height
-        known = fixed.get(own[0].photo)
         if known is not None and (known.at(*_at(mask, size).T) < 0).all():
             continue
         if mask.any():
-            found[name] = around(mask, size)
+            found[name] = around(_reduced(mask, small), size)
             notes.append(
                 f"Photos of {name} show marks at the same place of every picture, on"
                 f" {100 * mask.mean():.1f} % of it, that stay as they are while the ground beside"
@@ -142,6 +151,16 @@ def _differs(
             free = ~marked[row, column]
             found.append(np.abs(pictures[b][row, column][free] - own[seen][free]))
     return np.concatenate(found)
+
+
+def _reduced(mask: Mask, shape: tuple[int, ...]) -> Mask:
+    """A mask (h, w) as one of another shape, True where any of its pixels is: limits of photos are
+    looked at in places as far apart as pixels of thumbnails are, about.
+    """
+    if mask.shape[0] <= shape[0]:
+        return mask
+    share = cv2.resize(mask.astype(np.float32), shape[::-1], interpolation=cv2.INTER_AREA)
+    return np.asarray(share > 0)
 
 
 def _at(mask: Mask, size: tuple[int, int]) -> NDArray[np.float64]:

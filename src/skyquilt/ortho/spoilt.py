@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.inputs import GreyPicture
 from skyquilt.alignment.oblique_start import reach_of
 from skyquilt.imaging.blank import Blank, around, joined
 from skyquilt.imaging.nodes import View, project_all
@@ -77,12 +78,13 @@ def spoilt_parts(
     fixed: Mapping[int, Blank],
     gsd_cm: float | None = None,
     heat: Collection[int] = (),
+    grey: GreyPicture | None = None,
 ) -> tuple[dict[int, Blank], tuple[str, ...]]:
     """What yields to other photos, by photo (index), only of photos where something does, and
     notes. `details` as in `find_blurred`, `thumbnails` (h, w[, bands]), `names` of the photos,
     `fixed`: where they show marks, `gsd_cm`: ground size of a map pixel, None: that of the photos.
     `heat`: thermal photos, in which white is warm, and contrast that of a palette: neither tells
-    overexposure, smoke or fog.
+    overexposure, smoke or fog. `grey`: pictures of photos, by which thin marks are found.
     """
     flat = level(alignment.ground_m)
     placed = make_views(alignment, flat)
@@ -100,7 +102,7 @@ def spoilt_parts(
     xyz = alignment.ties.xyz
     views, apart = ([v for v in some if v.photo in of_8_bits] for some in (placed, apart))
     cameras = [alignment.camera_of[v.photo] for v in apart]
-    written, told = find_lasting_marks(apart, cameras, thumbnails, flat, fixed)
+    written, told = find_lasting_marks(apart, cameras, thumbnails, flat, fixed, grey)
     marks = {v.photo: written[c] for v in views if (c := alignment.camera_of[v.photo]) in written}
     notes += told
     marked = {**fixed, **marks}

@@ -187,7 +187,7 @@ def align_photos(
         priors=reported,
         links=links.links,
         control=given.control,
-        order=_order(found.photos, given.rank),
+        order=given.order_of(found.photos),
         grey=grey,
         make_room=lambda: make_room(found, grey, links),
         former=None if earlier is None else earlier.alignment_of(found.photos),
@@ -248,7 +248,9 @@ def find_ground(
         fixed = aligned.links.marks.shown([p.camera_key for p in looks.photos])
         small, names = looks.thumbnails(sorted(alignment.poses)), [p.name for p in looks.photos]
         heat = [i for i, p in enumerate(looks.photos) if p.band == "thermal"]
-        marks, notes = spoilt_parts(alignment, looks.detail, small, names, fixed, gsd_cm, heat)
+        marks, notes = spoilt_parts(
+            alignment, looks.detail, small, names, fixed, gsd_cm, heat, aligned.grey
+        )
         found = yield from ground.find_ground(
             alignment,
             aligned.grey,
@@ -389,10 +391,6 @@ def scene_of(
     aligned = yield from align_photos(given, methods, settings, clock)
     on = yield from find_ground(aligned, methods, settings, clock)
     return Scene(aligned=aligned, ground=on)
-
-
-def _order(photos: Sequence[Photo], rank: dict[str, int]) -> list[int]:
-    return [i for _, i in sorted((rank[p.name], i) for i, p in enumerate(photos) if p.name in rank)]
 
 
 def _links(

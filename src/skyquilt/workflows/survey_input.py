@@ -62,6 +62,13 @@ class SurveyInput:
         folders = all(Path(p).is_dir() for p in self.source)
         return f"{len(self.source)} {'folders' if folders else 'files'}"
 
+    def order_of(self, photos: Sequence[Photo]) -> list[int]:
+        """The photos (indices) in the order in which they are joined, without those that are not
+        to be.
+        """
+        ranked = ((self.rank[p.name], i) for i, p in enumerate(photos) if p.name in self.rank)
+        return [i for _, i in sorted(ranked)]
+
     def control_file(self, asked: Path | None) -> Path | None:
         """The file of control points that is asked for, else the only gcp_list.txt in a folder of
         photos or among files that are given.
