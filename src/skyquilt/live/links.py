@@ -39,7 +39,7 @@ class LiveLinks:
     ) -> None:
         self.members, self.methods, self.store, self.pixels = members, methods, store, pixels
         self._features: OrderedDict[int, PhotoFeatures] = OrderedDict()
-        self.marks = LiveMarks(members, self.features)
+        self.marks = LiveMarks(members, self.features, self.thumbnail)
         self.lenses = LiveLenses(members, self.features)
 
     def has_features(self, number: int) -> bool:

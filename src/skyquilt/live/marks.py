@@ -1,13 +1,17 @@
-"""Fixed marks of the pictures of a growing survey: a burnt-in text, a logo, dirt on the lens. They
-connect no photos, and are drawn only where nothing else shows the ground.
+"""What all pictures of a camera in a growing survey show at the same place: a burnt-in text, a
+logo, dirt on the lens. Such marks connect no photos, and are drawn only where nothing else shows
+the ground. Rims that show nothing (black corners, a frame) are not drawn.
 """
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from skyquilt.imaging.blank import Blank, Mask, marked
+from skyquilt.imaging.blank import LOOKED_AT, Blank, Mask, around, blank_rim, marked
+from skyquilt.imaging.grey import to_grey8
 from skyquilt.live.members import Member, Members
 from skyquilt.matching.fixed_marks import FindFixedMarks, FixedMarks
 from skyquilt.model.features import Features
@@ -25,13 +29,19 @@ class LiveMarks:
     them. What was found once stays. After a restart the same photos are looked at again.
     """
 
-    def __init__(self, members: Members, features: Callable[[int], Features]) -> None:
-        """`features` of a photo by its number."""
-        self.members, self.features = members, features
+    def __init__(
+        self,
+        members: Members,
+        features: Callable[[int], Features],
+        thumbnail: Callable[[int], NDArray[Any]],
+    ) -> None:
+        """`features`, and a `thumbnail` (h, w[, bands]), of a photo by its number."""
+        self.members, self.features, self.thumbnail = members, features, thumbnail
         self.find = FindFixedMarks()
         self.known = FixedMarks()
         self._looked = dict[str, int]()
         self._shown = dict[str, tuple[Mask, Blank]]()
+        self._rims = dict[str, Blank]()
 
     def look(self, camera: str) -> bool:
         """Looks for marks in the photos of a camera (`camera_key`) that were compared so far, if it
@@ -46,7 +56,21 @@ class LiveMarks:
             if count > looked:
                 news |= self._found(camera, own[:count]) and count > told
                 self._looked[camera] = count
+        self._see_rim(camera, own[: self._looked[camera]])
         return news
+
+    def rim(self, camera: str) -> Blank | None:
+        """Where photos of a camera show nothing; the same object until more photos tell."""
+        return self._rims.get(camera)
+
+    def _see_rim(self, camera: str, photos: list[Member]) -> None:
+        """Notes where none of these photos of a camera shows anything."""
+        some = [photos[k] for k in evenly(len(photos), LOOKED_AT)]
+        mask = blank_rim([to_grey8(self.thumbnail(m.id)) for m in some])
+        if mask is None:
+            self._rims.pop(camera, None)
+        else:
+            self._rims[camera] = around(mask, (some[0].photo.width, some[0].photo.height))
 
     def shown(self, camera: str) -> Blank | None:
         """Where photos of a camera show marks; the same object until others are found."""

@@ -23,6 +23,7 @@ from skyquilt.imaging.views import footprint
 from skyquilt.live.coarse_views import yielding_to_finer
 from skyquilt.live.failures import concerning
 from skyquilt.live.ledger import hit
+from skyquilt.live.marks import LiveMarks
 from skyquilt.live.members import Member
 from skyquilt.live.reduced_pictures import SmallPictures, measured
 from skyquilt.live.tone import Tone
@@ -132,11 +133,11 @@ class Canvas:
         members: dict[int, Member],
         store: Store,
         max_view_angle: float,
-        marks: Callable[[str], Blank | None],
+        marks: LiveMarks,
         badly: Sequence[Callable[[int], Blank | None]],
     ) -> None:
-        """`marks`: what the photos of a camera (its key) all show at one place of the picture;
-        `badly`: what a photo (its number) shows badly, such as all of a blurred one.
+        """`marks`: what the photos of a camera all show at one place of the picture; `badly`: what
+        a photo (its number) shows badly, such as all of a blurred one.
         """
         self.tiles, self.heights, self.members = tiles, heights, members
         self.gsd = 0.0
@@ -153,7 +154,7 @@ class Canvas:
         self._pictures = SmallPictures(full, members, store)
         self._white: dict[int, Blank | None] = {}
         self._marks, self._badly = marks, badly
-        self._marked: dict[str, Blank | None] = {}
+        self._marked: dict[str, tuple[Blank | None, ...]] = {}
         self._tone = Tone(self._pictures)
 
     def place(self, member: Member, camera: Camera) -> set[Address]:
@@ -217,8 +218,14 @@ class Canvas:
         surface = self.surface((x - reach, y - reach, x + reach, y + reach))
         self._sizes[member.id] = abs(z - self.ground) / camera.focal
         limits = self._limits(small, pose, surface)
-        fixed = self._marks(member.photo.camera_key)
-        parts = [fixed, self._overexposed(member, (w, h)), *(of(member.id) for of in self._badly)]
+        camera_key = member.photo.camera_key
+        if (rim := self._marks.rim(camera_key)) is not None:
+            limits = replace(limits, blank=replace(rim, size=(w, h)))
+        parts = [
+            self._marks.shown(camera_key),
+            self._overexposed(member, (w, h)),
+            *(of(member.id) for of in self._badly),
+        ]
         bad = [replace(part, size=(w, h)) for part in parts if part is not None]
         if bad:
             limits = replace(limits, mark=reduce(joined, bad))
@@ -239,10 +246,13 @@ class Canvas:
         return self._white[member.id]
 
     def remarked(self, camera: str) -> bool:
-        """Whether marks were found on the pictures of a camera (its key) since this was asked."""
-        now, before = self._marks(camera), self._marked.get(camera)
+        """Whether marks, or rims, were found on the pictures of a camera (its key) since this was
+        asked.
+        """
+        now = self._marks.shown(camera), self._marks.rim(camera)
+        before = self._marked.get(camera, (None, None))
         self._marked[camera] = now
-        return now is not before
+        return any(a is not b for a, b in zip(now, before, strict=True))
 
     def is_white(self, number: int) -> bool:
         """Whether a photo is on the map and overexposed in part."""
