@@ -45,6 +45,31 @@ def test_black_rims_are_found_where_they_were_drawn(shape):
     assert mask is not None and (mask == ~keep).mean() > 0.995
 
 
+def test_frames_of_two_colours_and_the_date_in_a_bar_are_found():
+    """The text of the date changes from photo to photo."""
+    frame, bar = np.ones((HIGH, WIDE), bool), np.zeros((HIGH, WIDE), bool)
+    frame[5:-5, 5:-5], bar[:25] = False, True
+    pictures = ground()
+    for i, p in enumerate(pictures):
+        p[frame], p[bar] = 250, 0
+        p[8:18, 40 + 3 * i : 80 + 5 * i : 4] = 255
+    mask = blank_rim([p.astype(np.uint8) for p in pictures])
+    assert mask is not None and (mask == (frame | bar)).mean() > 0.995
+
+
+def test_water_fog_and_burnt_skies_at_the_rim_are_no_frame():
+    """Alike in all photos, but it fades into what they show; a white sky that ends sharply does not
+    lie at the same place of all.
+    """
+    pictures = ground()
+    fade = np.clip(away(0, 0) / 150 - 0.4, 0, 1)
+    fog = [190 + fade * (p - 190) for p in pictures]
+    assert blank_rim([noisy(p, i) for i, p in enumerate(fog)]) is None
+    for i, p in enumerate(pictures):
+        p[: 12 * (i % 4)] = 255
+    assert blank_rim([noisy(p, i) for i, p in enumerate(pictures)]) is None
+
+
 @pytest.mark.parametrize("kind", ["ground", "vignetting", "night", "few", "hole"])
 def test_dark_ground_is_no_rim(kind):
     """Corners that a lens darkens rise slowly; a shadow lies at one place in some photos only; what

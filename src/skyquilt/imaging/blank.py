@@ -1,5 +1,5 @@
 """Parts of pictures along their rim that show nothing, so that they are not drawn: black corners of
-a circular fisheye or of photos that a program undistorted, bars, frames of one colour, and
+a circular fisheye or of photos that a program undistorted, frames and bars of one colour, and
 see-through pixels.
 """
 
@@ -17,18 +17,21 @@ LONGEST = 256
 """Longest side in px of the pictures that are compared."""
 BLACK = 12
 """Level of 255 up to which a picture shows nothing, in every photo of the camera."""
-EVEN, NEARLY, MOSTLY = 3, 12, 0.8
-"""A frame of one colour is even to so many levels of 255 over all photos, within this share of it
-at least; where compression has left something of the picture beside it, it is so nearly.
-"""
 EMPTY = 4
 """The same level of a see-through photo, whose empty pixels are 0 before contrast is stretched."""
 LEAST, MOST = 0.002, 0.7
 """Shares of a picture that may show nothing; less is noise, more is a picture of the night."""
 STEP, BESIDE = 25, 4
-"""By so many levels the pictures differ from it within so many px beside it, in the median: dark
-corners of a lens rise slowly.
+"""So much lighter the pictures are within so many px beside it, in the median: dark corners of a
+lens rise slowly.
 """
+EVEN, NEARLY, MOSTLY = 3, 12, 0.8
+"""Levels of 255 by which a frame or bar of one colour differs at most, within and between photos,
+on this share of it at least; where compression has left something of the picture beside it, it is
+so nearly.
+"""
+WRITTEN = 0.02
+"""A part of the picture that such a rim encloses, and that is smaller, is a text in a bar."""
 WIDER = 1.5
 """Width in px of the strip beside it that is not drawn either, since it is mixed with black."""
 REACH = 16.0
@@ -93,8 +96,8 @@ def find_blanks(
             share = 100 * float(np.median([m.mean() for m in masks.values()]))
             notes.append(
                 f"{len(masks)} photos of {name} show nothing on {share:.1f} % of the picture, along"
-                " its rim (black corners or bars, a frame, or see-through pixels): that is not"
-                " drawn."
+                " its rim (black corners, a frame or bars of one colour, or see-through pixels):"
+                " that is not drawn."
             )
     return found, tuple(notes)
 
@@ -130,33 +133,54 @@ def joined(a: Blank, b: Blank) -> Blank:
 def blank_rim(pictures: Sequence[NDArray[np.uint8]]) -> Mask | None:
     """Where none of some pictures (h, w) of one camera shows anything; None where all do."""
     lightest, darkest = np.max(pictures, axis=0), np.min(pictures, axis=0)
-    for mask in (_rim(lightest <= BLACK), _frame(lightest.astype(int), darkest.astype(int))):
+    rim = np.zeros(lightest.shape, bool)
+    for mask in (lightest <= BLACK, *_of_one_colour(lightest, darkest)):
+        mask = _rim(mask)
         if not LEAST < mask.mean() < MOST:
             continue
         away = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        beside = (away > WIDER) & (away <= BESIDE)
-        steps = [np.median(np.abs(p[beside] - float(np.median(p[mask])))) for p in pictures]
-        if np.median(steps) >= STEP:
-            return mask
-    return None
+        beside = (away > WIDER) & (away <= BESIDE) & ~rim
+        level = np.median(darkest[mask])
+        if level > BLACK:  # ground beside a frame may have its colour, but not in all photos
+            steps = (lightest - darkest)[beside]
+        else:
+            steps = np.array([np.median(p[beside]) - np.median(p[mask]) for p in pictures])
+        if steps.size and np.median(steps) >= STEP:
+            rim |= mask
+    return _without_writing(rim) if rim.any() else None
 
 
-def _frame(lightest: NDArray[Any], darkest: NDArray[Any]) -> Mask:
-    """The parts along the rim that have one level in all pictures, from the largest and the least
-    value (h, w) of each pixel. Ground that is even at one place of every picture (a canal beside
-    the line of flight) differs by more.
+def _of_one_colour(lightest: NDArray[np.uint8], darkest: NDArray[np.uint8]) -> list[Mask]:
+    """Where pictures are of one colour that is not black, from their `lightest` and `darkest`
+    values (h, w): a mask for each colour that their rim mostly has. Ground that is even at one
+    place of every picture (a canal beside the line of flight) differs by more.
     """
-    even = lightest - darkest <= EVEN
-    at_rim = np.ones(even.shape, bool)
-    at_rim[1:-1, 1:-1] = False
-    if not (at_rim & even).any():
-        return np.zeros(even.shape, bool)
-    level = int(np.bincount(darkest[at_rim & even]).argmax())
-    nearly = (lightest <= level + NEARLY) & (darkest >= level - NEARLY)
-    _, label = cv2.connectedComponents(nearly.astype(np.uint8), connectivity=4)
-    same = (lightest <= level + EVEN) & (darkest >= level - EVEN)
-    share = np.bincount(label[same], minlength=label.max() + 1) / np.bincount(label.ravel())
-    return np.asarray(np.isin(label, [k for k in rim_labels(label) if share[k] >= MOSTLY]))
+    rim = np.ones(lightest.shape, bool)
+    rim[1:-1, 1:-1] = False
+    counts = np.bincount(
+        darkest[(lightest - darkest <= EVEN) & (darkest > BLACK) & rim], minlength=256
+    )
+    light, dark = lightest.astype(int), darkest.astype(int)
+    found = list[Mask]()
+    while counts.max() > 0:
+        level = int(counts.argmax())
+        counts[max(level - NEARLY, 0) : level + NEARLY + 1] = 0
+        even, nearly = (
+            (light <= level + by) & (dark >= max(level - by, BLACK + 1)) for by in (EVEN, NEARLY)
+        )
+        _, label = cv2.connectedComponents(nearly.astype(np.uint8), connectivity=4)
+        share = np.bincount(label[even], minlength=label.max() + 1) / np.bincount(label.ravel())
+        found.append(np.asarray((share >= MOSTLY)[label] & nearly))
+    return found
+
+
+def _without_writing(rim: Mask) -> Mask:
+    """A rim (h, w) with the small parts of the picture that it encloses."""
+    count, label, stats, _ = cv2.connectedComponentsWithStats(
+        (~rim).astype(np.uint8), connectivity=4
+    )
+    small = stats[:, cv2.CC_STAT_AREA] < WRITTEN * rim.size
+    return np.asarray(rim | (np.isin(label, np.arange(1, count)) & small[label]))
 
 
 def rim_labels(label: NDArray[Any]) -> NDArray[Any]:

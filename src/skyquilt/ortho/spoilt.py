@@ -12,15 +12,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.inputs import GreyPicture
-from skyquilt.alignment.oblique_start import reach_of
-from skyquilt.imaging.blank import Blank, around, joined
+from skyquilt.imaging.blank import Blank, around, find_blanks, joined
+from skyquilt.imaging.grey import shrink, to_grey8
 from skyquilt.imaging.nodes import View, project_all
 from skyquilt.imaging.views import make_views, native_gsd, on_ground
 from skyquilt.model.poses import Alignment
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.exposure import Balance, Samples
-from skyquilt.ortho.lasting_marks import find_lasting_marks
+from skyquilt.ortho.lasting_marks import find_lasting_marks, on_other_ground
 from skyquilt.ortho.radiometry import InGrey
 from skyquilt.ortho.sharpness import FEWEST_SPOILT, LARGEST_SPOT, find_blurred
 from skyquilt.ortho.tie_surface import level
@@ -43,10 +42,6 @@ standard deviations below those around: dust takes 0.2 to 0.5.
 APART = 0.03
 """Two photos of a camera are compared whose places differ by more than this share of their height,
 about.
-"""
-MOVES = 0.7
-"""The ground behind a spot on the lens extends over at least this share of the extent of the
-places that photos were taken from; that behind a house that they circle around hardly moves.
 """
 WITHIN, FEWEST_VALUES = 9, 8
 """Cells along a side of these, and fewest values of a cell."""
@@ -78,49 +73,56 @@ def spoilt_parts(
     fixed: Mapping[int, Blank],
     gsd_cm: float | None = None,
     heat: Collection[int] = (),
-    grey: GreyPicture | None = None,
 ) -> tuple[dict[int, Blank], tuple[str, ...]]:
     """What yields to other photos, by photo (index), only of photos where something does, and
     notes. `details` as in `find_blurred`, `thumbnails` (h, w[, bands]), `names` of the photos,
     `fixed`: where they show marks, `gsd_cm`: ground size of a map pixel, None: that of the photos.
     `heat`: thermal photos, in which white is warm, and contrast that of a palette: neither tells
-    overexposure, smoke or fog. `grey`: pictures of photos, by which thin marks are found.
+    overexposure, smoke or fog.
     """
     flat = level(alignment.ground_m)
     placed = make_views(alignment, flat)
     apart = _apart(alignment, placed, flat)
     blurred, notes = find_blurred(alignment, details, names, {v.photo for v in apart})
     white, of_8_bits = dict[int, Blank](), set[int]()
+    blanks = _blanks(alignment, thumbnails)
     for i in sorted(alignment.poses):
         camera, thumbnail = alignment.camera(i), thumbnails[i]
         if thumbnail.dtype == np.uint8:
             of_8_bits.add(i)
-        if i not in heat and (part := overexposed(thumbnail, (camera.width, camera.height))):
+        size = camera.width, camera.height
+        if i not in heat and (part := overexposed(thumbnail, size, blanks.get(i))):
             white[i] = part
     if white:
         notes += (overexposed_note([names[i] for i in white]),)
     xyz = alignment.ties.xyz
     views, apart = ([v for v in some if v.photo in of_8_bits] for some in (placed, apart))
     cameras = [alignment.camera_of[v.photo] for v in apart]
-    written, told = find_lasting_marks(apart, cameras, thumbnails, flat, fixed, grey)
+    no_ground = with_parts(fixed, blanks)
+    written, told = find_lasting_marks(apart, cameras, thumbnails, flat, no_ground)
     marks = {v.photo: written[c] for v in views if (c := alignment.camera_of[v.photo]) in written}
     notes += told
-    marked = {**fixed, **marks}
+    marked = {**no_ground, **marks}
     spots, told = find_spots(alignment, views, apart, flat, thumbnails, marked)
     notes += told
     # what is overexposed or blurred has little contrast as well, and was told; a drop is not all
     pale = white.keys() | {i for i, part in blurred.items() if (part.room < 0).all()}
     of_light = [v for v in views if v.photo not in heat]
-    veiled = veiled_parts(of_light, xyz, thumbnails, fixed, spoilt=pale) if len(xyz) else {}
+    veiled = veiled_parts(of_light, xyz, thumbnails, no_ground, spoilt=pale) if len(xyz) else {}
     if unnamed := sorted(veiled.keys() - pale):
         notes += (veiled_note([names[i] for i in unnamed]),)
     gsd = gsd_cm / 100 if gsd_cm else native_gsd(placed, flat) if placed else 0.0
     coarse, told = coarser_parts(alignment, placed, names, gsd)
     notes += told
-    out = dict(fixed)
+    out = fixed
     for found in (marks, blurred, white, spots, veiled, coarse):
-        out |= {i: joined(out[i], b) if i in out else b for i, b in found.items()}
-    return out, notes
+        out = with_parts(out, found)
+    return dict(out), notes
+
+
+def with_parts(some: Mapping[int, Blank], more: Mapping[int, Blank]) -> Mapping[int, Blank]:
+    """Parts of photos, by index, that are in either."""
+    return {**some, **{i: joined(some[i], b) if i in some else b for i, b in more.items()}}
 
 
 def coarser_parts(
@@ -216,14 +218,27 @@ def overexposed_note(names: Sequence[str]) -> str:
     )
 
 
-def overexposed(thumbnail: NDArray[Any], size: tuple[int, int]) -> Blank | None:
+def _blanks(alignment: Alignment, thumbnails: Mapping[int, NDArray[Any]]) -> Mapping[int, Blank]:
+    """Where placed photos show nothing by their reduced pictures (h, w[, bands]), by index."""
+    placed = {i: alignment.camera(i) for i in sorted(alignment.poses)}
+    cameras = {i: (alignment.camera_of[i], (c.width, c.height)) for i, c in placed.items()}
+    return find_blanks(cameras, (), lambda i, px: to_grey8(shrink(thumbnails[i], px)[0]))[0]
+
+
+def overexposed(
+    thumbnail: NDArray[Any], size: tuple[int, int], blank: Blank | None = None
+) -> Blank | None:
     """Where a photo of a `size` (width and height in px) is overexposed, from its reduced picture
-    (h, w[, bands]); None where it is not, or has no 8-bit values.
+    (h, w[, bands]); None where it is not, or has no 8-bit values. A white frame (`blank`) is not
+    overexposed.
     """
     if thumbnail.dtype != np.uint8:
         return None
     lightest = thumbnail if thumbnail.ndim == 2 else thumbnail.max(2)
     white = np.asarray(lightest >= WHITE)
+    if blank is not None and white.any():
+        v, u = ((np.argwhere(white) + 0.5) * (np.array(size[::-1]) / white.shape) - 0.5).T
+        white[white] = blank.at(u, v) >= 0
     if white.mean() <= LEAST_WHITE:
         return None
     return around(white, size)
@@ -264,7 +279,7 @@ def find_spots(
             continue
         spot = _spots(samples.place[here], darker[here], size)
         mine = [v for v, is_own in zip(apart, own, strict=True) if is_own]
-        spot = _on_other_ground(spot, mine, size, flat)
+        spot = on_other_ground(spot, mine, size, flat)
         if spot.any():
             mark = around(np.kron(spot, np.ones((FINER, FINER))) > 0, size)
             found |= {v.photo: mark for v in views if alignment.camera_of[v.photo] == name}
@@ -342,26 +357,6 @@ def _spots(
     together = cv2.filter2D(dark.view(np.uint8), -1, square, borderType=cv2.BORDER_CONSTANT)
     spot = cv2.dilate((dark & (together > 1)).view(np.uint8), square) > 0
     return spot if spot.mean() <= LARGEST_SPOT else np.zeros_like(spot)
-
-
-def _on_other_ground(
-    spot: NDArray[np.bool_], views: Sequence[View], size: tuple[int, int], flat: Surface
-) -> NDArray[np.bool_]:
-    """The parts of a spot (rows, columns) that lie on other ground from view to view: what photos
-    circle around lies at the same place of each, too.
-    """
-    number, part = cv2.connectedComponents(spot.view(np.uint8))
-    centres = np.array([v.pose.map_C[:2] for v in views])
-    kept = np.zeros_like(spot)
-    for k in range(1, number):
-        rows, columns = np.nonzero(part == k)
-        box = np.array([[columns.min(), rows.min()], [columns.max() + 1, rows.max() + 1]])
-        px = box * np.array(size) / spot.shape[::-1] - 0.5
-        ground = np.array([on_ground(v, px, flat)[:, :2].mean(0) for v in views])
-        seen = np.isfinite(ground).all(1)  # not the sky
-        if reach_of(ground) >= MOVES * reach_of(centres[seen]):
-            kept |= part == k
-    return kept
 
 
 def _shares(place: NDArray[Any], size: tuple[int, int]) -> NDArray[np.float64]:

@@ -248,9 +248,7 @@ def find_ground(
         fixed = aligned.links.marks.shown([p.camera_key for p in looks.photos])
         small, names = looks.thumbnails(sorted(alignment.poses)), [p.name for p in looks.photos]
         heat = [i for i, p in enumerate(looks.photos) if p.band == "thermal"]
-        marks, notes = spoilt_parts(
-            alignment, looks.detail, small, names, fixed, gsd_cm, heat, aligned.grey
-        )
+        marks, notes = spoilt_parts(alignment, looks.detail, small, names, fixed, gsd_cm, heat)
         found = yield from ground.find_ground(
             alignment,
             aligned.grey,
