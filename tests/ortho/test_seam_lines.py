@@ -7,10 +7,11 @@ import pytest
 
 from skyquilt.engine.kept import Keep
 from skyquilt.engine.workers import Threads
-from skyquilt.imaging.blank import around, marked
+from skyquilt.imaging.blank import around, marked, whole_picture
 from skyquilt.imaging.nodes import densify, project_nodes
 from skyquilt.imaging.view_limits import ViewLimits
 from skyquilt.model.raster import Grid, Window
+from skyquilt.model.surface import Surface
 from skyquilt.ortho.bare_ground import bare_ground
 from skyquilt.ortho.contours import contour_lines
 from skyquilt.ortho.exposure import NEUTRAL
@@ -148,6 +149,30 @@ def test_what_stands_before_hides():
     assert hidden[rows & (x > 1.5) & (x < end - 0.75)].all()
     assert not hidden[rows & ((x > end + 0.75) | (x < -0.5))].any()
     assert not hidden[rows & wall].any()
+
+
+@pytest.mark.parametrize("written", [False, True])
+def test_a_text_yields_to_what_stands_before_the_place_and_blur_does_not(written):
+    """The strip behind a wall, seen by one photo through the wall and by the other, all of which is
+    blurred or written over.
+    """
+    z = np.zeros((241, 241), np.float32)
+    z[:, 121:125] = 10
+    surface = Surface(z=z, x0=-30.0, y0=-30.0, cell=0.25, source="dense")
+    mark = whole_picture((400, 300))
+    mark = replace(mark, written=mark if written else None)
+    clear, marked_one = view(0, -12, 0, surface=surface), view(1, 12, 0, surface=surface)
+    views = [clear, replace(marked_one, limits=ViewLimits(mark=mark))]
+    grey = np.full((300, 400), 120, np.uint8)
+    labels = SeamLines()(views, surface, GRID, lambda photo, side: grey, NEUTRAL)
+    x, y = labels.cells.x(np.arange(labels.cells.width)), labels.cells.y(np.arange(45))
+    strip = np.ix_(np.abs(y) < 5, (x > 2) & (x < 4.5))
+    assert (labels.photo[strip] == (0 if written else 1)).mean() > 0.9
+    assert labels.hidden[strip].mean() == written
+    open_ground = np.ix_(np.abs(y) < 5, (x > 7) & (x < 9))  # both see it
+    assert (labels.photo[open_ground] == 0).all() and not labels.hidden[open_ground].any()
+    alone = SeamLines()(views[1:], surface, GRID, lambda photo, side: grey, NEUTRAL)
+    assert (alone.photo[strip] == 1).all() and not alone.hidden[strip].any()
 
 
 def test_shares_of_all_photos_add_up_to_one():

@@ -79,6 +79,8 @@ def test_marks_stay_beside_what_is_white():
     px = np.array([[110.0, 120.0], [275.0, 240.0], [330.0, 60.0]])
     assert (marks[4].at(*px.T) < 0).tolist() == [True, True, False]
     assert (marks[5].at(*px.T) < 0).tolist() == [False, True, False]
+    # what is white may show ground, a text does not
+    assert (marks[4].written.at(*px.T) < 0).tolist() == [False, True, False]
 
 
 def test_parts_joined_are_those_of_either_at_any_resolution():

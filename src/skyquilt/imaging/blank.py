@@ -49,6 +49,10 @@ class Blank:
     """
     size: tuple[int, int]
     """Width and height of the photo in px."""
+    written: "Blank | None" = None
+    """The part of it that shows no ground at all, such as a text: rather is a place drawn as
+    another photo shows it before which something stands.
+    """
 
     def at(self, u: NDArray[Any], v: NDArray[Any]) -> NDArray[np.float32]:
         """`room` at photo columns and rows of any shape, interpolated linearly."""
@@ -127,7 +131,11 @@ def joined(a: Blank, b: Blank) -> Blank:
     if a.room.size < b.room.size:
         a, b = b, a
     other = cv2.resize(b.room, a.room.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    return Blank(room=np.minimum(a.room, np.asarray(other, np.float32)), size=a.size)
+    written = a.written or b.written
+    if a.written and b.written:
+        written = joined(a.written, b.written)
+    room = np.minimum(a.room, np.asarray(other, np.float32))
+    return Blank(room=room, size=a.size, written=written)
 
 
 def blank_rim(pictures: Sequence[NDArray[np.uint8]]) -> Mask | None:

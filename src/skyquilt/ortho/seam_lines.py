@@ -53,6 +53,10 @@ GRAZING = 0.3
 """Length of a cell in a photo, over that on level ground, below which it counts as hidden."""
 SMEARED = np.float32(5e2)
 """Added where its pixels are smeared over the ground, or show a mark."""
+WRITTEN = np.float32(2.5e3)
+"""Added besides where a mark shows no ground at all: a tree that stands before the place is less
+odd on a map than a text.
+"""
 SHADOWS_BYTES = 60_000_000
 """Bytes of hidden places of photos that are kept in memory."""
 
@@ -85,7 +89,7 @@ class SeamLines:
     """The same for a height of one metre or more above the surroundings, in grey values."""
     least: int = 24
     """Undisputed patches of fewer cells are contested too."""
-    version: ClassVar[int] = 6
+    version: ClassVar[int] = 7
 
     def __call__(
         self,
@@ -171,7 +175,8 @@ class SeamLines:
         index = np.array([*(v.photo for v in views), -1], np.int32)
         # what is smeared, marked or white floods no place that another one shows well; what is
         # hidden may: objects are cut less
-        worse = np.abs(best[1:] - np.where(order[0] >= 0, best[0], 0) - SMEARED) < SMEARED / 2
+        gain = best[1:] - np.where(order[0] >= 0, best[0], 0)
+        worse = (np.abs(gain - SMEARED) < SMEARED / 2) | (gain > WRITTEN - HIDDEN + SMEARED / 2)
         ranked = index[np.concatenate([order[:1], np.where(worse, -1, order[1:])])]
         centre = np.array([(*v.pose.map_C[:2],) for v in views] + [(0.0, 0.0)])
         apart = np.hypot(*(centre[order[0]] - centre[order[1]]).transpose(2, 0, 1))
@@ -195,7 +200,8 @@ class SeamLines:
             ranked=ranked,
             sure=sure,
             height=np.clip(level, 0, 255).astype(np.uint8),
-            hidden=(best[0] >= HIDDEN) & (order[0] >= 0),
+            hidden=(np.where(best[0] < WRITTEN, best[0], best[0] - WRITTEN) >= HIDDEN)
+            & (order[0] >= 0),
         )
 
 
@@ -321,7 +327,10 @@ class _Scene:
                 own[densify(smear.astype(np.float32), *size, 2) > 0.5] += SMEARED
             if (mark := view.limits.mark) is not None:  # so does what was written over the ground
                 u, v = (densify(px[near], *size, 2) for px in (n.u, n.v))
-                own[mark.near(u, v, _half_cell_px(n.u[near], n.v[near]))] += SMEARED
+                half = _half_cell_px(n.u[near], n.v[near])
+                own[mark.near(u, v, half)] += SMEARED
+                if mark.written is not None:
+                    own[mark.written.near(u, v, half)] += WRITTEN
             shadow = self._shadows(view.photo)
             if not shadow.empty:
                 x, y, z = fx[at], fy[at], over[at]

@@ -6,6 +6,7 @@ darker than what others show of the same ground, and than what lies beside it in
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -114,8 +115,10 @@ def spoilt_parts(
     gsd = gsd_cm / 100 if gsd_cm else native_gsd(placed, flat) if placed else 0.0
     coarse, told = coarser_parts(alignment, placed, names, gsd)
     notes += told
-    out = fixed
-    for found in (marks, blurred, white, spots, veiled, coarse):
+    out: Mapping[int, Blank] = {
+        i: replace(b, written=b) for i, b in with_parts(fixed, marks).items()
+    }
+    for found in (blurred, white, spots, veiled, coarse):
         out = with_parts(out, found)
     return dict(out), notes
 

@@ -85,7 +85,12 @@ def labels_key(
         methods.seams,
         picture_recipe(),
         [p.pixels_key for p in photos],
-        *([(i, m.room) for i, m in sorted(ground.limits.marks.items())]),
+        *(
+            [
+                (i, m.room, m.written and m.written.room)
+                for i, m in sorted(ground.limits.marks.items())
+            ]
+        ),
         *_growth(ground),
     )
 
