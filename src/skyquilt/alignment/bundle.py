@@ -20,7 +20,14 @@ from skyquilt.alignment.near_positions import told_besides
 from skyquilt.alignment.oblique import contradicting, found_oblique, hung, tilts_reported
 from skyquilt.alignment.oblique_guess import LOWERED, guessed_priors, lowered
 from skyquilt.alignment.oblique_start import NO_BEGINNINGS, beginnings, reported_start, slanting
-from skyquilt.alignment.outcome import accuracy, ground_points, leave_one_out, misfits, undetermined
+from skyquilt.alignment.outcome import (
+    accuracy,
+    ground_points,
+    leave_one_out,
+    misfits,
+    unconfirmed,
+    undetermined,
+)
 from skyquilt.alignment.problem import Problem, State
 from skyquilt.alignment.repairs import begun_with, repaired
 from skyquilt.alignment.setup import Setup, camera_records, pose_records, priors_by_camera, set_up
@@ -378,6 +385,8 @@ def _outcome(
         accuracy=accuracy(setup, problem, state, full)
         if predicted and full and len(ties.px)
         else None,
-        notes=undetermined(setup, problem, state, full) + misfits(setup, problem, state),
+        notes=undetermined(setup, problem, state, full)
+        + unconfirmed(setup, problem)
+        + misfits(setup, problem, state),
         loo_rms_m=leave_one_out(problem, state, alone) if setup.georeferenced else None,
     )

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.adjust import Covariance
-from skyquilt.alignment.deviations import drift, likeness, point_deviations
+from skyquilt.alignment.deviations import FEWEST_ERRORS, drift, likeness, point_deviations
 from skyquilt.alignment.problem import Problem, State, residuals_px
 from skyquilt.alignment.setup import TURNED, Setup
 from skyquilt.alignment.stages import heights_above, prune
@@ -191,6 +191,24 @@ def undetermined(
                 " photos or lines at two heights would."
             )
     return tuple(notes)
+
+
+def unconfirmed(setup: Setup, problem: Problem) -> tuple[str, ...]:
+    """A sentence where few of many photos have a position: nothing shows whether these err by more
+    than they state.
+    """
+    known = np.isfinite(problem.C0[:, :2]).all(1)
+    few, several = int(known.sum()), len(problem.C0)
+    if not 0 < few < min(FEWEST_ERRORS, several / 2) or np.isfinite(problem.X0).any():
+        return ()
+    stated = float(np.median(setup.stated_sigma_C[known, 0]))
+    their = "position of one" if few == 1 else f"positions of {few}"
+    return (
+        f"The map's place rests on the {their} of {several} photos. So few do not show whether they"
+        f" err by more than is taken for them ({stated:.2g} m), as those of phones and single fixes"
+        " do by 5 to 10 m: the map is as wrong as they are. Positions of more photos, or control"
+        " points, would tell.",
+    )
 
 
 def misfits(setup: Setup, problem: Problem, state: State) -> tuple[str, ...]:
