@@ -448,6 +448,7 @@ def test_a_black_or_white_photo_is_not_placed_by_its_metadata(level, placed):
     found = with_loose_photos(done, inputs)
     assert (9 in found.poses) == placed
     assert placed or "black or white" in found.rejected[9]
+    assert not placed or found.notes[-1].startswith("9.jpg is placed by its metadata: it could")
 
 
 # places by which oblique photos are paired

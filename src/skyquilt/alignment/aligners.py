@@ -305,14 +305,14 @@ def _grounded(
 
 
 def with_loose_photos(alignment: Alignment, inputs: AlignmentInputs) -> Alignment:
-    """Adds photos without links, placed by their own metadata relative to the adjusted ones, with a
-    note each; photos that lack metadata, or are black or white, are rejected. Where only the
-    heading is missing, the direction of flight tells it, if it tells that of the adjusted ones.
+    """Adds photos without links, placed by their own metadata relative to the adjusted ones, with
+    notes; photos that lack metadata, or are black or white, are rejected. Where only the heading is
+    missing, the direction of flight tells it, if it tells that of the adjusted ones.
     """
     photos, priors = inputs.photos, inputs.priors
     poses, cameras = dict(alignment.poses), dict(alignment.cameras)
     camera_of, rejected = dict(alignment.camera_of), dict(alignment.rejected)
-    blocks, notes = list(alignment.blocks), list(alignment.notes)
+    blocks, notes, loose = list(alignment.blocks), list(alignment.notes), dict[str, list[str]]()
     offset = median_offset(alignment, priors)
     flown = _flown(alignment, inputs, offset)
     for i, photo in enumerate(photos):
@@ -344,7 +344,11 @@ def with_loose_photos(alignment: Alignment, inputs: AlignmentInputs) -> Alignmen
         camera_of[i] = photo.camera_key
         blocks.append((i,))
         by = "position and the direction of flight" if by_course else "metadata"
-        notes.append(f"{photo.name} is placed by its {by}: {weak}.")
+        loose.setdefault(f"placed by its {by}: {weak}.", []).append(photo.name)
+    for how, names in loose.items():
+        several = f"{len(names)} photos ({sentence_of(names)}) are each"
+        some = several if len(names) > 1 else f"{names[0]} is"
+        notes.append(f"{some} {how}")
     return replace(
         alignment,
         poses=poses,
