@@ -132,6 +132,24 @@ def test_a_text_is_drawn_only_where_nothing_else_is(
     assert (np.concatenate(off) > 40).mean() < 0.02
 
 
+def test_frames_are_not_drawn(plain, tmp_path):
+    """They are found at the sixth photo: tiles of the others are drawn again."""
+    (tmp_path / "framed").mkdir()
+    for path in plain.photos[:8]:
+        image = Image.open(path)
+        pixels = np.full((360, 480, 3), 255, np.uint8)
+        pixels[18:-18, 24:-24] = np.array(image.convert("RGB"))[18:-18, 24:-24]
+        kept = {"exif": image.info["exif"], "xmp": image.info["xmp"], "quality": 92}
+        Image.fromarray(pixels).save(tmp_path / "framed" / path.name, **kept)
+    live = fed(
+        opened(tmp_path / "out", deterministic=True), sorted((tmp_path / "framed").iterdir())
+    )
+    tiles = [live.tiles.get(a) for a in live.tiles.addresses("visible", 0)]
+    live.close()
+    white = np.concatenate([(t.pixels[t.shown] > 250).all(-1) for t in tiles])
+    assert len(white) > 50_000 and white.mean() < 0.001  # with the frames drawn: 0.11
+
+
 def test_a_restart_goes_on_with_the_same_marks(stamped, tmp_path):
     through = fed(opened(tmp_path / "through", deterministic=True), stamped[:9])
     begun = fed(opened(tmp_path / "again", deterministic=True), stamped[:7])

@@ -154,7 +154,7 @@ class LiveMap:
             self.members.by_id,
             self.store,
             self.settings.max_view_angle,
-            self.live_links.marks,
+            self.live_links.marks.alike,
             (blur.of, veils.of, LivePlaced(self.members).of),
         )
         self.canvas.gsd = float(self.ledger.meta("gsd", 0.0))

@@ -59,9 +59,11 @@ class LiveMarks:
         self._see_rim(camera, own[: self._looked[camera]])
         return news
 
-    def rim(self, camera: str) -> Blank | None:
-        """Where photos of a camera show nothing; the same object until more photos tell."""
-        return self._rims.get(camera)
+    def alike(self, camera: str) -> tuple[Blank | None, Blank | None]:
+        """Where photos of a camera show marks, and where nothing; the same objects until more
+        photos tell.
+        """
+        return self.shown(camera), self._rims.get(camera)
 
     def _see_rim(self, camera: str, photos: list[Member]) -> None:
         """Notes where none of these photos of a camera shows anything."""

@@ -23,7 +23,6 @@ from skyquilt.imaging.views import footprint
 from skyquilt.live.coarse_views import yielding_to_finer
 from skyquilt.live.failures import concerning
 from skyquilt.live.ledger import hit
-from skyquilt.live.marks import LiveMarks
 from skyquilt.live.members import Member
 from skyquilt.live.reduced_pictures import SmallPictures, measured
 from skyquilt.live.tone import Tone
@@ -133,11 +132,11 @@ class Canvas:
         members: dict[int, Member],
         store: Store,
         max_view_angle: float,
-        marks: LiveMarks,
+        alike: Callable[[str], tuple[Blank | None, Blank | None]],
         badly: Sequence[Callable[[int], Blank | None]],
     ) -> None:
-        """`marks`: what the photos of a camera all show at one place of the picture; `badly`: what
-        a photo (its number) shows badly, such as all of a blurred one.
+        """`alike`: where the photos of a camera (its key) all show marks, and where nothing;
+        `badly`: what a photo (its number) shows badly, such as all of a blurred one.
         """
         self.tiles, self.heights, self.members = tiles, heights, members
         self.gsd = 0.0
@@ -153,7 +152,7 @@ class Canvas:
         self._by_tile: dict[Address, set[int]] = defaultdict(set)
         self._pictures = SmallPictures(full, members, store)
         self._white: dict[int, Blank | None] = {}
-        self._marks, self._badly = marks, badly
+        self._alike, self._badly = alike, badly
         self._marked: dict[str, tuple[Blank | None, ...]] = {}
         self._tone = Tone(self._pictures)
 
@@ -218,14 +217,10 @@ class Canvas:
         surface = self.surface((x - reach, y - reach, x + reach, y + reach))
         self._sizes[member.id] = abs(z - self.ground) / camera.focal
         limits = self._limits(small, pose, surface)
-        camera_key = member.photo.camera_key
-        if (rim := self._marks.rim(camera_key)) is not None:
+        fixed, rim = self._alike(member.photo.camera_key)
+        if rim is not None:
             limits = replace(limits, blank=replace(rim, size=(w, h)))
-        parts = [
-            self._marks.shown(camera_key),
-            self._overexposed(member, (w, h)),
-            *(of(member.id) for of in self._badly),
-        ]
+        parts = [fixed, self._overexposed(member, (w, h)), *(of(member.id) for of in self._badly)]
         bad = [replace(part, size=(w, h)) for part in parts if part is not None]
         if bad:
             limits = replace(limits, mark=reduce(joined, bad))
@@ -246,11 +241,8 @@ class Canvas:
         return self._white[member.id]
 
     def remarked(self, camera: str) -> bool:
-        """Whether marks, or rims, were found on the pictures of a camera (its key) since this was
-        asked.
-        """
-        now = self._marks.shown(camera), self._marks.rim(camera)
-        before = self._marked.get(camera, (None, None))
+        """Whether marks or a rim of a camera's (its key) pictures were found since it was asked."""
+        now, before = self._alike(camera), self._marked.get(camera, (None, None))
         self._marked[camera] = now
         return any(a is not b for a, b in zip(now, before, strict=True))
 
