@@ -71,6 +71,38 @@ def test_noise_and_gross_errors_are_no_parts(count, seed):
     assert brought_together(*survey(true, told, 1.5)) is None
 
 
+@pytest.mark.parametrize("count", range(6, 12))
+def test_few_photos_tell_one_clear_displacement(count):
+    """Those of a receiver that jumped soon after it began."""
+    for seed in range(3):
+        rng = np.random.default_rng([count, seed])
+        true, begins = lines(count), int(rng.integers(3, count - 2))
+        told = true + rng.normal(0, 1.5, true.shape)
+        told[:begins, :2] += rng.permutation([24.0, 18.0]) * rng.choice([-1, 1], 2)
+        found, names, priors, cameras = survey(true, told, 3.0)
+        moved = brought_together(found, names, priors, cameras)
+        assert f"from {begins:03d}.jpg on" in moved.note
+        assert abs(moved.apart_m - 30) < 9
+        off = np.array([p.map_C[:2] for p in moved.priors]) - true[:, :2]
+        assert np.abs(off[begins:].mean(0) - off[:begins].mean(0)).max() < 8
+        assert brought_together(found, names, priors, cameras, few=False) is None
+
+
+@pytest.mark.parametrize("count", range(6, 12))
+def test_noise_and_drifts_of_few_photos_are_no_displacement(count):
+    """Errors of a receiver, which are alike from photo to photo or not, and of moments."""
+    for seed in range(4):
+        rng = np.random.default_rng([count, seed])
+        true = lines(count)
+        steps = rng.normal(0, 3.0, (count + 40, 2))
+        drift = np.array([0.9 ** np.arange(k, -1, -1) @ steps[: k + 1] for k in range(count + 40)])
+        back_and_forth = 2.0 * np.where(np.arange(count) // 6 % 2, -1, 1)[:, None] * (0.0, 1.0)
+        for off in (steps[40:], drift[40:] * np.sqrt(1 - 0.81), back_and_forth):
+            told = true.copy()
+            told[:, :2] += off
+            assert brought_together(*survey(true, told, 3.0)) is None
+
+
 def test_what_is_small_beside_the_deviations_is_left_alone():
     true = lines(24)
     told = true + np.random.default_rng(1).normal(0, 0.01, true.shape)

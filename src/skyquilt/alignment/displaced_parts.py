@@ -27,6 +27,11 @@ CLEARER = 0.35
 """With one more part, squared misfits fall to less than this share of what they were: by chance
 they fall to a half at most.
 """
+FEW, CLEAR, CLEAR_APART, CLEAR_M = 3, 0.15, 3.0, 9.0
+"""Fewer photos than those, but so many, tell one displacement by more than this times their
+deviations and so many m (moments and tilts move lines by less), where misfits fall below the share:
+by chance they fall to a fifth at most.
+"""
 MOST_PARTS = 8
 """Parts into which a survey is divided at most."""
 LOOKED_AT = 60
@@ -93,7 +98,7 @@ class _Compared(NamedTuple):
 def _compared(found: Alignment, priors: Sequence[Prior]) -> _Compared | None:
     """The photos that tell of displaced positions; None where they are too few."""
     own = [i for i in found.held if np.isfinite(priors[i].map_C[:2]).all()]
-    if found.frame.crs is None or len(own) < 2 * FEWEST:
+    if found.frame.crs is None or len(own) < 2 * FEW:
         return None
     return _Compared(
         own=own,
@@ -104,17 +109,25 @@ def _compared(found: Alignment, priors: Sequence[Prior]) -> _Compared | None:
 
 
 def brought_together(
-    found: Alignment, names: Sequence[str], priors: Sequence[Prior], cameras: Sequence[str]
+    found: Alignment,
+    names: Sequence[str],
+    priors: Sequence[Prior],
+    cameras: Sequence[str],
+    *,
+    few: bool = True,
 ) -> Displaced | None:
     """The priors with the positions of displaced parts brought together, the middle of all staying,
     by their deviations; None where no part is displaced. Photos are in order of capture, under
     their `names` and those of their `cameras`, which may be those of drones that fly together.
+    `few`: parts may also be of few photos.
     """
     positions = _compared(found, priors)
     if positions is None:
         return None
     own, placed, told, sigma = positions
     part, drones = _parts(placed, told), _drones([cameras[i] for i in own])
+    if few and not part.any():
+        part = _few(positions)
     together = np.zeros(len(own), np.int64)
     several = _misfit(placed, told, drones) < CLEARER * _misfit(placed, told, together)
     several &= _misfit(placed, told, drones) < _misfit(placed, told, part)
@@ -167,7 +180,7 @@ def outvoted(
     limit = AGREE * max(float(np.median(off)), float(np.median(sigma)))
     agree = off < limit
     fit = float(np.median(off[agree])) if agree.any() else np.inf
-    if agree.all() or 2 * agree.sum() <= len(own) or agree.sum() < FEWEST:
+    if len(own) < 2 * FEWEST or agree.all() or 2 * agree.sum() <= len(own) or agree.sum() < FEWEST:
         return None
     if (agree & (off > limit / 2)).mean() > BETWEEN:
         return None
@@ -176,7 +189,7 @@ def outvoted(
     if np.std(placed[agree]) < REACH * np.std(placed):
         return None
     apart = float(np.median(off[~agree]))
-    if apart < MOST_APART_M and brought_together(found, names, priors, cameras) is not None:
+    if apart < MOST_APART_M and brought_together(found, names, priors, cameras, few=False):
         return None
     out, away = list(priors), [i for i, a in zip(own, agree.tolist(), strict=True) if not a]
     for i, bare in zip(away, without_places([priors[i] for i in away]), strict=True):
@@ -218,6 +231,8 @@ def _drones(cameras: Sequence[str]) -> Parts:
 def _parts(placed: Complex, told: Complex) -> Parts:
     """The part of each photo: a part is divided as long as that makes misfits far smaller."""
     part = np.zeros(len(placed), np.int64)
+    if len(part) < 2 * FEWEST:
+        return part
     misfit = _misfit(placed, told, part)
     for _ in range(MOST_PARTS - 1):
         rough = np.linspace(FEWEST, len(part) - FEWEST, LOOKED_AT).astype(int)
@@ -231,6 +246,19 @@ def _parts(placed: Complex, told: Complex) -> Parts:
             break
         part, misfit = middle, _misfit(placed, told, middle)
     return part
+
+
+def _few(positions: _Compared) -> Parts:
+    """The part of each photo, one of the two being of few; all the same where nothing is clear."""
+    _, placed, told, sigma = positions
+    together = np.zeros(len(placed), np.int64)
+    ends = range(FEW, len(placed) - FEW + 1)
+    misfit = {k: _misfit(placed, told, _divided(together, k)) for k in ends}
+    best = min(misfit, key=lambda k: misfit[k])
+    part = _divided(together, best)
+    first, second = _shifts(placed, told, part)
+    far = abs(second - first) > max(CLEAR_APART * float(np.median(sigma)), CLEAR_M)
+    return part if far and misfit[best] < CLEAR * _misfit(placed, told, together) else together
 
 
 def _middle_part(placed: Complex, told: Complex, part: Parts, below: float) -> Parts:
