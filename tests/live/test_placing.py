@@ -73,6 +73,34 @@ def test_a_photo_that_tells_no_tilt_is_compared_with_those_beside_it_in_time(liv
     assert neighbours.of(known[4], far) == []
 
 
+def test_a_photo_that_belongs_elsewhere_is_compared_with_those_there(live, monkeypatch):
+    """A receiver jumped: few of those near the position that it tells show the same."""
+    local_pose, last = live.refinement.local_pose, live.members.by_id[4]
+    there = last.pose.map_C[:2].copy()
+    jumped = replace(last.pose, map_C=last.pose.map_C + (40.0, 0.0, 0.0))
+
+    def near(_, pose):
+        return [1] if pose.map_C[0] > there[0] + 20 else [1, 3, 2]
+
+    monkeypatch.setattr(local_pose.neighbours, "of", near)
+    monkeypatch.setattr(last, "pose", jumped)
+    change = local_pose.refine(last)
+    assert {pair for pair, link in change.links.items() if link} > {(3, 4)}
+    assert np.linalg.norm(change.moved[4].map_C[:2] - there) < 5.0
+
+
+def test_a_photo_whose_position_leaps_is_linked_before_it_is_drawn(live, monkeypatch):
+    metadata, last = live.initial_pose.metadata, live.members.by_id[4]
+    (recent,) = metadata._recent.values()
+    monkeypatch.setitem(recent, 1, live.members.by_id[1])
+    second = live.members.by_id[2]
+    monkeypatch.setattr(second, "prior", replace(last.prior, map_C=second.pose.map_C))
+    assert not metadata.loose(last, last.pose)
+    told = replace(last.prior, map_C=last.prior.map_C + (0.0, -60.0, 0.0))
+    monkeypatch.setattr(last, "prior", told)
+    assert metadata.loose(last, last.pose)
+
+
 def test_photos_taken_next_to_one_are_those_of_other_blocks(live, monkeypatch):
     neighbours, known = live.refinement.local_pose.neighbours, live.members.by_id
     assert [neighbours.taken_next(m) for m in known.values()] == [[], [], [], []]

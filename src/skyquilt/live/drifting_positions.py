@@ -14,6 +14,11 @@ LAST, SURPRISE = 3, 2.0
 """So many photos tell that positions suddenly err by more, if their errors are, in the root mean
 square, so many times as large as usual.
 """
+FASTER, LONGER, FEWEST_STEPS, TICK_S = 1.5, 3.0, 2, 0.5
+"""A position leaps that lies further from the one before than a drone flies that is so many times
+as fast as usual, for so many times as long as usual at most, by so many steps; least time in s
+between photos, as clocks tell whole seconds.
+"""
 RAYLEIGH = 1.18
 """Median length of errors in the plane over their deviation per axis."""
 
@@ -48,7 +53,24 @@ def unforeseen_m(off: Array, usual: float) -> float:
     left[1:] -= share * off[:-1]
     if share:
         usual = float(np.median(np.linalg.norm(left[1:], axis=1))) / RAYLEIGH
-    if len(off) < FEWEST:
+    if len(off) < LAST:
         return usual
+    if len(off) < FEWEST:  # they do not tell how alike they are, but which is unlike the others
+        left = off - np.median(off, axis=0)
     last = float(np.sqrt((left[-LAST:] ** 2).mean()))
     return last if last > SURPRISE * usual else usual
+
+
+def leap_m(way: Array, s: Array, at: Array, then: float) -> float:
+    """By how many metres a photo's position `at` (2,), told for the moment `then`, lies further
+    from the one before it, or from the first, than the drone flies: by the positions (n, 2) in m of
+    others and their times in s, ascending. 0 where it does not, or where nothing tells.
+    """
+    if len(way) < FEWEST_STEPS + 1 or not np.isfinite(then):
+        return 0.0
+    lasted = np.maximum(np.diff(s), TICK_S)
+    usual = float(np.median(np.linalg.norm(np.diff(way, axis=0), axis=1) / lasted))
+    before = max(int(np.searchsorted(s, then)) - 1, 0)
+    took = np.clip(abs(then - s[before]), TICK_S, LONGER * np.median(lasted))
+    away = float(np.linalg.norm(at - way[before]))
+    return max(away - FASTER * usual * float(took), 0.0)

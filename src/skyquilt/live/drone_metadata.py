@@ -4,6 +4,7 @@ same source.
 
 from bisect import bisect_left
 from collections import defaultdict, deque
+from datetime import UTC
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from skyquilt.geometry.frames import (
     cam_R_map_from_angles,
 )
 from skyquilt.live.common_tilt import common_tilt
-from skyquilt.live.drifting_positions import RAYLEIGH, foreseen, unforeseen_m
+from skyquilt.live.drifting_positions import RAYLEIGH, foreseen, leap_m, unforeseen_m
 from skyquilt.live.members import Member, Members
 from skyquilt.live.settings import LiveSettings
 from skyquilt.model.poses import Pose, Prior
@@ -118,6 +119,18 @@ class Metadata:
         off = np.array([found[1:] for found in known], np.float64).reshape(-1, 2)
         return off, bisect_left([found[0] for found in known], capture_order(member.photo))
 
+    def _leap_m(self, member: Member) -> float:
+        """By how many metres the position of a photo lies further from the one before than its
+        drone flies.
+        """
+        known = sorted(
+            (_seconds(m), *m.prior.map_C[:2].tolist())
+            for m in self._recent[_source(member)].values()
+            if m.id != member.id and np.isfinite([_seconds(m), *m.prior.map_C[:2]]).all()
+        )
+        way = np.array(known, np.float64).reshape(-1, 3)
+        return leap_m(way[:, 1:], way[:, 0], member.prior.map_C[:2], _seconds(member))
+
     def _flown(self, member: Member) -> float:
         """The heading in degrees of a photo that reports none, by its direction of flight, as
         recent photos of the source are headed; 0 where these do not tell it.
@@ -169,16 +182,19 @@ class Metadata:
 
     def loose(self, member: Member, pose: Pose) -> bool:
         """Whether a photo will most likely lie beside its neighbours by this pose, from its
-        metadata: its heading is not known, or positions, heights or headings of photos before it
-        were badly off, each in another way. False where there is no photo to be linked with.
+        metadata: its heading is not known, its position leaps, or positions, heights or headings of
+        photos before it were badly off, each in another way. False where there is no photo to be
+        linked with.
         """
         if not any(m.tried for m in self.members.on_map()):
             return False
         if not np.isfinite(member.prior.yaw_deg):
             return True
         above = max(float(pose.map_C[2]) - self.ground_at(pose.map_C), 2.0)
-        off = unforeseen_m(self._errors(member)[0], self.scatter())
-        if off > LOOSE * above * member.photo.width / member.photo.focal.px:
+        visible = LOOSE * above * member.photo.width / member.photo.focal.px
+        if unforeseen_m(self._errors(member)[0], self.scatter()) > visible:
+            return True
+        if self._leap_m(member) > visible:
             return True
         turns, lifts, z = self._learned(member)
         if _astray_deg(turns[np.isfinite(turns)]) > LOOSE_DEG:
@@ -239,6 +255,12 @@ class Metadata:
 
 def _source(member: Member) -> str:
     return f"{member.source}|{member.photo.camera_key}"
+
+
+def _seconds(member: Member) -> float:
+    """When a photo was taken by its own clock, in s; NaN where it does not tell."""
+    time = member.photo.time
+    return time.replace(tzinfo=UTC).timestamp() if time is not None else np.nan
 
 
 def _told_R(prior: Prior, yaw_deg: float) -> NDArray[np.float64]:

@@ -31,6 +31,10 @@ STRAY_HIGH, STRAY_DEG = 0.02, 2.0
 """Share of the flying height, and angle in degrees, by which a new photo may move a neighbour; more
 is no correction of what stood there, but a neighbour that little holds.
 """
+ELSEWHERE_HIGH = 0.2
+"""Share of the flying height by which a photo was found beside the place where it was sought, from
+which other photos are near it.
+"""
 NO_MAP = "no photo has a position so far, and too few overlap for a map without a place"
 MISLED = (
     "by its matches the photos around it would lie elsewhere than their positions: they are of"
@@ -93,7 +97,8 @@ class LocalPose:
         links = self.live_links.compared(member, self.neighbours.of(member, member.pose))
         links |= more
         links |= self._strangers(member, member.pose, links)
-        if member.pose is not None and not any(links.values()):  # its position may be far off
+        lost = member.pose is None or not any(links.values())
+        if lost and member.pose is not None:  # its position may be far off
             near = [i for i in self.neighbours.taken_next(member) if (i, member.id) not in links]
             links |= self.live_links.compared(member, near)
         good = {key: k for key, k in links.items() if k is not None}
@@ -105,11 +110,11 @@ class LocalPose:
         if self.members.frame is None:
             return _unmoved(links, NO_MAP)
         change = self._joined(member, links, good)
-        found = change.moved.get(member.id) if member.pose is None else None
-        if found is None:
+        found = change.moved.get(member.id)
+        if found is None or not (lost or self._elsewhere(member.pose, found)):
             return change
-        # by its links alone a photo is compared with those that came before it: now its place tells
-        # which others it overlaps
+        # it was compared with those taken before it, or near a place that is not its own: now its
+        # place tells which others it overlaps
         near = [i for i in self.neighbours.of(member, found) if (i, member.id) not in links]
         more = self.live_links.compared(member, near)
         more |= self._strangers(member, found, links | more)
@@ -117,6 +122,13 @@ class LocalPose:
         links |= more
         joined = self._joined(member, links, good) if any(more.values()) else change
         return joined if member.id in joined.moved else change
+
+    def _elsewhere(self, pose: Pose | None, found: Pose) -> bool:
+        """Whether a photo was found so far from where it stood that others are near it."""
+        if pose is None:
+            return True
+        high = max(float(found.map_C[2]) - self.metadata.ground_at(found.map_C), 1.0)
+        return float(np.hypot(*(found.map_C - pose.map_C)[:2])) > ELSEWHERE_HIGH * high
 
     def _strangers(
         self, member: Member, pose: Pose | None, links: Mapping[tuple[int, int], Link | None]
