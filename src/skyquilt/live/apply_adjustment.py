@@ -1,9 +1,9 @@
 """Applies the result of a block adjustment to the map."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyquilt.live.background_adjustment import BlockAdjustment
 from skyquilt.live.events import Update
@@ -27,8 +27,8 @@ VALUES = r"[0-9][0-9.]*(e\+?[0-9]+)?|\([^()]*\)"
 
 
 class ApplyAdjustment:
-    """Stores the new poses of a block. Photos that were placed during the job move with their
-    neighbours and are refined again.
+    """Stores the new poses of a block. Photos that were placed during the job turn and move with
+    their neighbours and are refined again.
     """
 
     def __init__(self, refinement: Refinement) -> None:
@@ -49,9 +49,10 @@ class ApplyAdjustment:
             return self._failed(done.problem)
         if self._outdated(done):
             return self._failed("all of it has been adjusted with more photos since")
-        before = {i: self.members.by_id[i].pose for i in done.poses}
-        steps = {
-            i: p.map_C - old.map_C for i, p in done.poses.items() if (old := before[i]) is not None
+        moved = {
+            i: (old, new)
+            for i, new in done.poses.items()
+            if (old := self.members.by_id[i].pose) is not None
         }
         since = self._since(done)
         text = f"{len(done.poses)} photos were adjusted together"
@@ -61,8 +62,7 @@ class ApplyAdjustment:
             self.refinement.heights(done.xyz, done.poses, known=bool(done.cameras), together=True)
             self.refinement.move(done.poses, done.camera_of)
             self.refinement.put_back(self._left(done))
-            for member in since:
-                self._follow(member, steps)
+            self._follow(since, moved)
             self.schedule.write(self.ledger)
             self.ledger.tell("note", {"text": text})
             if len(done.ids) >= FEWEST_TOLD:
@@ -119,17 +119,41 @@ class ApplyAdjustment:
             if self.members.by_id[i].state == "refined":
                 self.redraw.changed(self.members.by_id[i])
 
-    def _follow(self, member: Member, steps: dict[int, NDArray[np.float64]]) -> None:
-        near = [steps[j] for j in sorted(member.links) if j in steps]
-        if member.pose is None or not near:
-            return
-        step = np.median(np.array(near), axis=0)
-        pose = replace(member.pose, map_C=member.pose.map_C + step)
+    def _follow(self, since: list[Member], moved: dict[int, tuple[Pose, Pose]]) -> None:
+        """Carries photos along with those that they are linked with, or that are themselves carried
+        along; `moved`: former and new poses. On a line, those placed last are linked with others
+        that came since alone, and would stay behind.
+        """
+        known, left = dict(moved), [m for m in since if m.pose is not None]
+        while left:
+            near = {m.id: [known[j] for j in sorted(m.links) if j in known] for m in left}
+            now = {
+                m.id: (m.pose, carried(m.pose, near[m.id])) for m in left if m.pose and near[m.id]
+            }
+            if not now:
+                return
+            known |= now
+            for member in left:
+                if member.id in now:
+                    self._try_again(member, now[member.id][1])
+            left = [m for m in left if m.id not in now]
+
+    def _try_again(self, member: Member, pose: Pose) -> None:
+        """Moves a photo, and refines it again."""
         self.refinement.move({member.id: pose}, {member.id: member.camera})
         if member not in self.queues.untried:
             member.tried = 0
             self.members.save(member, about=about_record(member, ""))
             self.queues.untried.append(member)
+
+
+def carried(pose: Pose, near: Sequence[tuple[Pose, Pose]]) -> Pose:
+    """A pose that turns and moves as some others have, by their former and new poses."""
+    turns = np.sum([new.cam_R_map.T @ old.cam_R_map for old, new in near], axis=0)
+    u, _, vt = np.linalg.svd(turns)
+    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    places = [new.map_C + turn @ (pose.map_C - old.map_C) for old, new in near]
+    return replace(pose, cam_R_map=pose.cam_R_map @ turn.T, map_C=np.median(places, axis=0))
 
 
 def _differs(pose: Pose | None, before: Pose | None) -> bool:
