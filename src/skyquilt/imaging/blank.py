@@ -22,8 +22,9 @@ EMPTY = 4
 LEAST, MOST = 0.002, 0.7
 """Shares of a picture that may show nothing; less is noise, more is a picture of the night."""
 STEP, BESIDE = 25, 4
-"""So much lighter the pictures are within so many px beside it, in the median: dark corners of a
-lens rise slowly.
+"""So much lighter the pictures are within so many px beside a black one, and so much they differ
+there from each other beside one of another colour, in the median: dark corners of a lens rise
+slowly.
 """
 EVEN, NEARLY, MOSTLY = 3, 12, 0.8
 """Levels of 255 by which a frame or bar of one colour differs at most, within and between photos,
@@ -184,11 +185,8 @@ def _of_one_colour(lightest: NDArray[np.uint8], darkest: NDArray[np.uint8]) -> l
 
 def _without_writing(rim: Mask) -> Mask:
     """A rim (h, w) with the small parts of the picture that it encloses."""
-    count, label, stats, _ = cv2.connectedComponentsWithStats(
-        (~rim).astype(np.uint8), connectivity=4
-    )
-    small = stats[:, cv2.CC_STAT_AREA] < WRITTEN * rim.size
-    return np.asarray(rim | (np.isin(label, np.arange(1, count)) & small[label]))
+    _, label = cv2.connectedComponents((~rim).astype(np.uint8), connectivity=4)
+    return np.asarray(rim | (np.bincount(label.ravel()) < WRITTEN * rim.size)[label])
 
 
 def rim_labels(label: NDArray[Any]) -> NDArray[Any]:

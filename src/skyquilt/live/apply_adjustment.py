@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from skyquilt.live.background_adjustment import BlockAdjustment
 from skyquilt.live.events import Update
@@ -149,9 +150,8 @@ class ApplyAdjustment:
 
 def carried(pose: Pose, near: Sequence[tuple[Pose, Pose]]) -> Pose:
     """A pose that turns and moves as some others have, by their former and new poses."""
-    turns = np.sum([new.cam_R_map.T @ old.cam_R_map for old, new in near], axis=0)
-    u, _, vt = np.linalg.svd(turns)
-    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    turns = np.array([new.cam_R_map.T @ old.cam_R_map for old, new in near])
+    turn = Rotation.from_matrix(turns).mean().as_matrix()
     places = [new.map_C + turn @ (pose.map_C - old.map_C) for old, new in near]
     return replace(pose, cam_R_map=pose.cam_R_map @ turn.T, map_C=np.median(places, axis=0))
 

@@ -109,7 +109,7 @@ def find_ground(
     yield 0, 1
     xyz = alignment.ties.xyz
     flat = level(alignment.ground_m)
-    blanks, notes = _blanks(alignment, see_through, grey)
+    blanks, notes = blanks_of(alignment, see_through, grey)
     limits = view_limits(alignment, flat, picture.max_view_angle)
     limits = replace(limits, blanks=blanks, marks=marks)
     rough = make_views(alignment, flat, limits)
@@ -196,10 +196,12 @@ def _most_shown(views: Sequence[View]) -> Sequence[View]:
     return shown or views
 
 
-def _blanks(
+def blanks_of(
     alignment: Alignment, see_through: Collection[int], grey: GreyPicture
 ) -> tuple[dict[int, Blank], tuple[str, ...]]:
-    """Where placed photos show nothing, and notes on them."""
+    """Where placed photos show nothing, by index, and notes on them; the rest as in
+    `find_blanks`.
+    """
     cameras = {}
     for i in sorted(alignment.poses):
         camera = alignment.camera(i)

@@ -13,13 +13,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.blank import Blank, around, find_blanks, joined
+from skyquilt.imaging.blank import Blank, around, joined
 from skyquilt.imaging.grey import shrink, to_grey8
 from skyquilt.imaging.nodes import View, project_all
 from skyquilt.imaging.views import make_views, native_gsd, on_ground
 from skyquilt.model.poses import Alignment
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.exposure import Balance, Samples
+from skyquilt.ortho.ground import blanks_of
 from skyquilt.ortho.lasting_marks import find_lasting_marks, on_other_ground
 from skyquilt.ortho.radiometry import InGrey
 from skyquilt.ortho.sharpness import FEWEST_SPOILT, LARGEST_SPOT, find_blurred
@@ -86,7 +87,7 @@ def spoilt_parts(
     apart = _apart(alignment, placed, flat)
     blurred, notes = find_blurred(alignment, details, names, {v.photo for v in apart})
     white, of_8_bits = dict[int, Blank](), set[int]()
-    blanks = _blanks(alignment, thumbnails)
+    blanks, _ = blanks_of(alignment, (), lambda i, px: to_grey8(shrink(thumbnails[i], px)[0]))
     for i in sorted(alignment.poses):
         camera, thumbnail = alignment.camera(i), thumbnails[i]
         if thumbnail.dtype == np.uint8:
@@ -219,13 +220,6 @@ def overexposed_note(names: Sequence[str]) -> str:
         f"{some} overexposed in part ({sentence_of(names)}): what is white there is drawn only"
         " where no other photo shows the ground."
     )
-
-
-def _blanks(alignment: Alignment, thumbnails: Mapping[int, NDArray[Any]]) -> Mapping[int, Blank]:
-    """Where placed photos show nothing by their reduced pictures (h, w[, bands]), by index."""
-    placed = {i: alignment.camera(i) for i in sorted(alignment.poses)}
-    cameras = {i: (alignment.camera_of[i], (c.width, c.height)) for i, c in placed.items()}
-    return find_blanks(cameras, (), lambda i, px: to_grey8(shrink(thumbnails[i], px)[0]))[0]
 
 
 def overexposed(

@@ -86,10 +86,8 @@ def labels_key(
         picture_recipe(),
         [p.pixels_key for p in photos],
         *(
-            [
-                (i, m.room, m.written and m.written.room)
-                for i, m in sorted(ground.limits.marks.items())
-            ]
+            (i, m.room, m.written and m.written.room)
+            for i, m in sorted(ground.limits.marks.items())
         ),
         *_growth(ground),
     )
