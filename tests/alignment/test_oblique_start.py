@@ -273,6 +273,7 @@ def test_photos_that_stay_turned_are_hung_on_the_others(ahead):
         unfit=None,
         false_focals=None,
         cut=None,
+        wholes=None,
         focals=None,
         beginnings=lambda tried: oblique_start.NO_BEGINNINGS,
         guess=None,

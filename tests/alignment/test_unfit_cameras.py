@@ -19,11 +19,13 @@ from skyquilt.alignment.unfit_cameras import (
     cut_cameras,
     cut_notes,
     false_focals,
+    fits_cut,
     loosened,
     other_focals,
     uncentred,
     unfit_cameras,
     unfit_notes,
+    whole_focals,
 )
 from skyquilt.model.camera import Camera
 from skyquilt.model.photo import Focal, Shutter
@@ -159,6 +161,7 @@ def flown_as(find):
         names=[], cameras=[], speeds=None, linked=8, adjust=find, guess=None, beginnings=None,
         unfit=lambda t: frozenset(), focals=lambda t: ({}, True), false_focals=lambda t: ({}, True),
         cut=lambda t: cut_cameras(t.found, priors),
+        wholes=lambda t: whole_focals(t.found, t.begun.cut, t.begun.focals),
     )  # fmt: skip
 
 
@@ -186,6 +189,41 @@ def test_principal_points_that_stood_for_tilts_are_held_again(slanting, monkeypa
     last = repairs.repaired(repairs.Tried(found=find(begun), begun=begun), survey)
     assert last.begun.cut == (set() if slanting else {"cam"})
     assert last.notes == (() if slanting else cut_notes(last.found, {"cam"}))
+
+
+@pytest.mark.parametrize(("cx", "fits"), [(700.0, True), (WIDTH + 5.0, False), (-5.0, False)])
+def test_no_picture_is_cut_off_beyond_its_middle(cx, fits, monkeypatch):
+    monkeypatch.setattr("skyquilt.alignment.unfit_cameras.fits_better", lambda *_, **more: True)
+    assert fits_cut(found_at(cx, 300.0), alignment()) == fits
+
+
+@pytest.mark.parametrize(
+    ("right", "down", "longer"),
+    [(160, 0, 1.4), (-160, 10, 1.4), (39, 30, None), (0, 200, 1.25), (0, 100, None)],
+)
+def test_focal_lengths_count_for_the_picture_before_it_was_cut_off(right, down, longer):
+    """800 x 600 px; the principal point is in the middle of the whole picture."""
+    found = found_at((WIDTH - 1) / 2 + right, (HEIGHT - 1) / 2 + down)
+    told = {} if longer is None else {"cam": pytest.approx(longer)}
+    assert whole_focals(found, {"cam"}, {}) == told
+    told = {} if longer is None else {"cam": pytest.approx(2 * longer)}
+    assert whole_focals(found, {"cam"}, {"cam": 2.0}) == told
+    assert whole_focals(found, (), {}) == {}
+
+
+@pytest.mark.parametrize("fits", [True, False])
+def test_a_cut_picture_begins_again_with_the_focal_length_of_the_whole(fits, monkeypatch):
+    def find(begun):
+        right = 160.0 if begun.cut else 30.0
+        return found_at((WIDTH - 1) / 2 + right, (HEIGHT - 1) / 2)
+
+    monkeypatch.setattr(repairs, "fits_cut", lambda *both: True)
+    monkeypatch.setattr(repairs, "fits_as_well", lambda *both: fits)
+    (cut,) = (r for r in repairs.REPAIRS if r.__name__ == "_cut_pictures")
+    begun = repairs.Beginning(priors=[prior((0.0, 0.0, 60.0))] * 8)
+    last = cut(repairs.Tried(found=find(begun), begun=begun), flown_as(find))
+    assert last.begun.cut == {"cam"}
+    assert last.begun.focals == ({"cam": pytest.approx(1.4)} if fits else {})
 
 
 @pytest.fixture

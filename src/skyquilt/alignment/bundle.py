@@ -45,6 +45,7 @@ from skyquilt.alignment.unfit_cameras import (
     other_focals,
     uncentred,
     unfit_cameras,
+    whole_focals,
 )
 from skyquilt.alignment.upside_down import turned_note, upside_down
 from skyquilt.engine.free_memory import give_back
@@ -88,7 +89,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 84
+    version: ClassVar[int] = 85
 
     def __call__(
         self,
@@ -134,6 +135,7 @@ class Bundle:
 
         guesses = {p.camera_key: p.focal for p in photos if p.lens_guessed}
         told = {p.camera_key: p.focal for p in photos if p.focal_alone}
+        doubtful = (guesses.keys() | told.keys()) - {p.camera_key for p in photos if p.whole_told}
         survey = Survey(
             names=[p.name for p in photos],
             cameras=[p.camera_key for p in photos],
@@ -142,6 +144,7 @@ class Bundle:
             adjust=adjust,
             unfit=lambda t: unfit_cameras(t.found, priors_of(t)),
             cut=lambda t: cut_cameras(t.found, priors_of(t)),
+            wholes=lambda t: whole_focals(t.found, t.begun.cut & doubtful, t.begun.focals),
             focals=lambda t: other_focals(t.found, guesses, t.begun.focals),
             false_focals=lambda t: false_focals(t.found, told, t.begun.focals),
             beginnings=lambda t: beginnings(t.found, photos, t.begun.priors),

@@ -197,9 +197,15 @@ def _enlargements(last: Tried, survey: Survey) -> Tried:
 
 
 def _cut_pictures(last: Tried, survey: Survey) -> Tried:
-    """Principal points of photos that were cut off are told by these alone."""
+    """Principal points of photos that were cut off are told by these alone, and the focal lengths
+    of files count for the whole pictures.
+    """
     cameras = survey.cut(last)
-    return _freed(last, survey, cameras, fits_cut, cut=cameras, name="cut ")
+    best = _freed(last, survey, cameras, fits_cut, cut=cameras, name="cut ")
+    if best is last or not (focals := survey.wholes(best)):
+        return best
+    whole = survey.tried(best.begun, focals={**best.begun.focals, **focals}, name="whole ")
+    return replace(whole, notes=last.notes) if fits_as_well(whole.found, best.found) else best
 
 
 def _held_in_the_middle(last: Tried, survey: Survey) -> Tried:

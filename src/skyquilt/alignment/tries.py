@@ -68,6 +68,8 @@ class Survey:
     """Names of cameras that photos contradict (`unfit_cameras`)."""
     cut: Callable[[Tried], frozenset[str]]
     """Names of those whose photos may have been cut off (`cut_cameras`)."""
+    wholes: Callable[[Tried], Mapping[str, float]]
+    """Factors of focal lengths that files tell of the pictures before (`whole_focals`)."""
     focals: Callable[[Tried], tuple[Mapping[str, float], bool]]
     """Factors of guessed focal lengths that may be others (`other_focals`)."""
     false_focals: Callable[[Tried], tuple[Mapping[str, float], bool]]

@@ -41,6 +41,10 @@ OFF_MIDDLE = 3.0
 """A principal point so many deviations off the middle of the picture contradicts that nothing was
 cut off.
 """
+CUT_BESIDE = 0.1
+"""Share of the longer side by which a picture must have been longer before it was cut off, as the
+principal point tells, for the focal length to count for that side: less is a lens off its middle.
+"""
 ASSUMED_MIDDLE, LOOSE_MIDDLE = 0.009, 0.15
 """Deviations of the principal point as shares of the picture's longer side: one at least as wide is
 assumed, and that of what pictures alone tell.
@@ -158,8 +162,29 @@ def unfit_notes(found: Alignment, cameras: Collection[str]) -> tuple[str, ...]:
 
 
 def fits_cut(other: Alignment, found: Alignment) -> bool:
-    """Whether an alignment with principal points that pictures tell fits these clearly better."""
-    return fits_better(other, found, kept=KEPT)
+    """Whether an alignment with principal points that pictures tell fits these clearly better, and
+    has none outside a picture: such a part is seldom cut out, and other misfits look like it.
+    """
+    inside = all(0 < c.cx < c.width - 1 and 0 < c.cy < c.height - 1 for c in other.cameras.values())
+    return inside and fits_better(other, found, kept=KEPT)
+
+
+def whole_focals(
+    found: Alignment, cameras: Collection[str], begun: Mapping[str, float]
+) -> dict[str, float]:
+    """Multiples of focal lengths to begin with instead (`begun`: those that an alignment began
+    with), of cameras whose photos are parts: what files tell counts for the longer side of the
+    picture that the camera took, which has the principal point in its middle.
+    """
+    out = dict[str, float]()
+    for key in sorted(cameras):
+        camera = found.cameras[key]
+        size = np.array([camera.width, camera.height], float)
+        beside = np.abs(np.array([camera.cx, camera.cy]) - (size - 1) / 2)
+        longer = float((size + 2 * beside).max() / size.max())
+        if longer > 1 + CUT_BESIDE:
+            out[key] = longer * begun.get(key, 1.0)
+    return out
 
 
 def cut_notes(found: Alignment, cameras: Collection[str]) -> tuple[str, ...]:

@@ -190,6 +190,10 @@ class Photo:
     """A phrase on what its metadata give as a calibration and no lens can have; it is ignored."""
     focal: Focal
     """Always present; a guess with a large standard deviation where nothing is known."""
+    whole_told: bool = False
+    """Whether it shows a part of the picture that the camera took, and EXIF tells the size of that:
+    the focal length is the one of that picture.
+    """
     position: GeoPosition | None
     """None where the photo has none or it is invalid, e.g. (0, 0); then a note reports it."""
     height_m: float | None = None

@@ -11,7 +11,7 @@ relative deviation: half of the table's visible cameras lie below 0.71, nine in 
 """
 
 
-def guessed_focal(width: int, height: int, *, thermal: bool) -> Focal:
+def guessed_focal(width: float, height: float, *, thermal: bool) -> Focal:
     """The focal length of an unknown camera whose pictures have `width` x `height` px."""
     multiple, share = _GUESSED_THERMAL if thermal else _GUESSED
     px = multiple * (width if thermal else max(width, height))

@@ -15,6 +15,7 @@ from skyquilt.model.photo import Focal
 from skyquilt.outside import plain
 from skyquilt.photos import tags as tag
 from skyquilt.photos.guesses import guessed_focal
+from skyquilt.photos.native import Native
 from skyquilt.photos.tags import Exif, Xmp
 
 
@@ -91,48 +92,29 @@ rounded.
 """
 
 
-def native_scale(exif: Exif, width: int, height: int) -> tuple[float, str]:
-    """Pixels of the file per pixel as captured, and a note where the aspect ratios differ.
-
-    EXIF keeps the size that the camera wrote, also in a reduced copy. 1.0 where EXIF has no size.
-    """
-    x, y = exif.number(tag.PIXELS_X), exif.number(tag.PIXELS_Y)
-    if not x or not y or not (1 <= x <= 1e6 and 1 <= y <= 1e6):
-        return 1.0, ""
-    long, short = max(x, y), min(x, y)
-    scale = max(width, height) / long
-    if abs(min(width, height) / short / scale - 1) > 0.02:
-        return scale, (
-            f"EXIF says {x:.0f}x{y:.0f} px, the file has {width}x{height}: cropped or padded, so"
-            " the focal "
-            "length and any calibration in the metadata are uncertain."
-        )
-    return scale, ""
-
-
 def find_focal(
     *,
     exif: Exif,
     sensor: Sensor | None,
     calibration: Camera | None,
-    width: int,
-    height: int,
+    native: Native,
     thermal: bool = False,
 ) -> Focal:
     """The first available of: calibrated, mm on the sensor, focal-plane resolution, 35 mm
-    equivalent, a guess.
+    equivalent, a guess; in px of the file.
     """
+    size = native.width, native.height
     candidates = (
-        _calibrated(calibration),
-        _on_sensor(exif, sensor, width, height),
-        _believed_plane(exif, width, height),
-        _from_35mm(exif, width, height),
+        _on_sensor(exif, sensor, *size),
+        _believed_plane(exif, *size),
+        _from_35mm(exif, *size),
     )
-    long = max(width, height)
-    for found in candidates:
+    in_file = (native.focal_of_file(f) for f in candidates if f)
+    long = max(native.file)
+    for found in (_calibrated(calibration), *in_file):
         if found and _PLAUSIBLE[0] * long <= found.px <= _PLAUSIBLE[1] * long:
             return found
-    return guessed_focal(width, height, thermal=thermal)
+    return native.focal_of_file(guessed_focal(*size, thermal=thermal))
 
 
 def digital_zoom(exif: Exif) -> float:
@@ -141,7 +123,7 @@ def digital_zoom(exif: Exif) -> float:
     return zoom if 1.0 < zoom <= _MOST_ZOOM else 1.0
 
 
-def focal_notes(exif: Exif, sensor: Sensor | None, width: int, height: int) -> tuple[str, ...]:
+def focal_notes(exif: Exif, sensor: Sensor | None, native: Native) -> tuple[str, ...]:
     """Notes on focal lengths in EXIF that disagree, and on a digital zoom."""
     zoom = digital_zoom(exif)
     zoomed = (
@@ -149,12 +131,14 @@ def focal_notes(exif: Exif, sensor: Sensor | None, width: int, height: int) -> t
         if zoom > 1
         else ""
     )
-    direct = _on_sensor(exif, sensor, width, height) or _on_plane(exif, width, height)
-    rounded = _from_35mm(exif, width, height)
+    size = native.width, native.height
+    direct = _on_sensor(exif, sensor, *size) or _on_plane(exif)
+    rounded = _from_35mm(exif, *size)
     if direct and rounded and not _agree(direct.px, rounded.px):
+        px, other = (native.focal_of_file(f).px for f in (direct, rounded))
         return zoomed, (
-            f"Its focal length in mm corresponds to {direct.px:.0f} px, its 35 mm equivalent to"
-            f" {rounded.px:.0f} px; "
+            f"Its focal length in mm corresponds to {px:.0f} px, its 35 mm equivalent to"
+            f" {other:.0f} px; "
             "one of them is wrong."
         )
     return (zoomed,)
@@ -167,7 +151,7 @@ def _calibrated(camera: Camera | None) -> Focal | None:
     return Focal(px=camera.focal, sigma_px=sigma, source="calibrated")
 
 
-def _on_sensor(exif: Exif, sensor: Sensor | None, width: int, height: int) -> Focal | None:
+def _on_sensor(exif: Exif, sensor: Sensor | None, width: float, height: float) -> Focal | None:
     if sensor is None:
         return None
     written = exif.number(tag.FOCAL_MM)
@@ -178,21 +162,21 @@ def _on_sensor(exif: Exif, sensor: Sensor | None, width: int, height: int) -> Fo
     return Focal(px=px, sigma_px=(0.02 if written else 0.05) * px, source="sensor")
 
 
-def _on_plane(exif: Exif, width: int, height: int) -> Focal | None:
+def _on_plane(exif: Exif) -> Focal | None:
     mm, resolution = exif.number(tag.FOCAL_MM), exif.number(tag.PLANE_X)
     unit = _MM_PER_UNIT.get(int(exif.number(tag.PLANE_UNIT) or 2))
     if not mm or not resolution or unit is None or mm < 0 or resolution < 0:
         return None
-    px = mm * resolution / unit * native_scale(exif, width, height)[0] * digital_zoom(exif)
+    px = mm * resolution / unit * digital_zoom(exif)
     return Focal(px=px, sigma_px=0.03 * px, source="focal-plane")
 
 
-def _believed_plane(exif: Exif, width: int, height: int) -> Focal | None:
+def _believed_plane(exif: Exif, width: float, height: float) -> Focal | None:
     """By focal-plane resolution, in the unit with which it agrees with the 35 mm equivalent, since
     cameras confuse inches and centimetres. Where it agrees in none, either of the two may be wrong:
     what is nearer to the usual focal length is taken, and known no better than that.
     """
-    found, rounded = _on_plane(exif, width, height), _from_35mm(exif, width, height)
+    found, rounded = _on_plane(exif), _from_35mm(exif, width, height)
     if found is None or rounded is None or _agree(found.px, rounded.px):
         return found
     stated = _MM_PER_UNIT[int(exif.number(tag.PLANE_UNIT) or 2)]
@@ -209,7 +193,7 @@ def _agree(px: float, other: float) -> bool:
     return 1 / _APART < px / other < _APART
 
 
-def _from_35mm(exif: Exif, width: int, height: int) -> Focal | None:
+def _from_35mm(exif: Exif, width: float, height: float) -> Focal | None:
     mm = exif.number(tag.FOCAL_35MM)
     if not mm or mm < _WIDEST_35MM:
         return None
@@ -239,15 +223,14 @@ class FoundCalibration:
 
 
 def read_calibration(
-    *, exif: Exif, xmp: Xmp, sensor: Sensor | None, width: int, height: int, scale: float
+    *, exif: Exif, xmp: Xmp, sensor: Sensor | None, picture: Native
 ) -> FoundCalibration:
     """The first of DJI's `DewarpData` or `DewarpDataK6`, Pix4D's `Camera:Perspective*` or
     `Camera:Fisheye*` and DJI's `CalibratedFocalLength` that a lens can have.
 
-    `scale` is this file's px per px as captured (`lens.native_scale`): the calibration refers to
-    the latter.
+    The calibration refers to the picture as captured.
     """
-    native = (round(width / scale), round(height / scale))
+    native = (round(picture.width), round(picture.height))
     readers: tuple[tuple[str, Callable[[], Camera | str | None]], ...] = (
         ("DewarpData", lambda: _dewarp(xmp, native)),
         ("Camera:Perspective...", lambda: _perspective(exif, xmp, sensor, native)),
@@ -262,7 +245,7 @@ def read_calibration(
         if isinstance(found, Camera):
             found = _of_this_size(found, others)
         if isinstance(found, Camera):
-            return FoundCalibration(camera=found.rescaled(width, height), nonsense=tuple(nonsense))
+            return FoundCalibration(camera=picture.camera_of_file(found), nonsense=tuple(nonsense))
         if found:
             nonsense.append(f"{name}: {found}")
     return FoundCalibration(nonsense=tuple(nonsense))

@@ -13,7 +13,7 @@ import numpy as np
 from skyquilt.engine.store import Store, digest
 from skyquilt.errors import UnreadablePhotoError
 from skyquilt.model.camera import Camera
-from skyquilt.model.photo import Focal, Photo, RejectedPhoto, Stored
+from skyquilt.model.photo import Focal, Photo, RejectedPhoto, Shutter, Stored
 from skyquilt.outside import MOST_MP, check_picture, open_regular, plain, whole
 from skyquilt.photos import tags as tag
 from skyquilt.photos.flir import MOST_THERMAL_MP
@@ -24,7 +24,6 @@ from skyquilt.photos.lens import (
     find_focal,
     find_sensor,
     focal_notes,
-    native_scale,
     read_calibration,
 )
 from skyquilt.photos.metadata import (
@@ -39,6 +38,7 @@ from skyquilt.photos.metadata import (
     read_time,
     read_velocity,
 )
+from skyquilt.photos.native import Native, native_picture
 from skyquilt.photos.pixels import read_tiff
 from skyquilt.photos.shutter import find_shutter
 from skyquilt.photos.thermal import (
@@ -165,7 +165,7 @@ class _Lens:
     calibration: Camera | None
     nonsense: tuple[str, ...]
     focal: Focal
-    captured_mp: float
+    native: Native
     notes: tuple[str, ...]
 
 
@@ -218,6 +218,7 @@ def _photo(path: Path, name: str, header: Header, thermal_unit: str | None) -> P
         band_name=tag.band_shown(header.xmp),
         unusable_calibration=" and ".join(lens.nonsense),
         focal=lens.focal,
+        whole_told=lens.native.part,
         position=position,
         height_m=None if position else _height(header),
         attitude=attitude,
@@ -227,12 +228,22 @@ def _photo(path: Path, name: str, header: Header, thermal_unit: str | None) -> P
         time=time,
         orientation_tag=whole(header.exif.tags.get(tag.ORIENTATION), 1, 8) or 1,
         rolling_shutter=rolling,
-        shutter=find_shutter(header.exif.text(tag.MODEL), lens.captured_mp, rolling),
+        shutter=_shutter(header, lens.native, rolling),
         velocity_ned=read_velocity(header.xmp),
         editor=find_editor(header.exif, header.xmp),
         coding="" if header.jpeg is None else header.jpeg.coding,
         notes=tuple(n for n in (*_broken_notes(header), *strange, *seen, *more) if n),
     )
+
+
+def _shutter(header: Header, native: Native, rolling: bool | None) -> Shutter:
+    """That of the rows that the file shows."""
+    megapixels = native.width * native.height / 1e6
+    found = find_shutter(header.exif.text(tag.MODEL), megapixels, rolling)
+    if found.source != "table":
+        return found
+    readout, sigma = found.readout_s * native.rows, found.sigma_s * native.rows
+    return replace(found, readout_s=readout, sigma_s=sigma)
 
 
 def _height(header: Header) -> float | None:
@@ -267,29 +278,23 @@ def _bare(header: Header) -> Header:
 
 def _lens(header: Header, width: int, height: int, *, thermal: bool) -> _Lens:
     exif = header.exif
-    scale, note = native_scale(exif, width, height)
-    sensor = find_sensor(model=exif.text(tag.MODEL), long_side=round(max(width, height) / scale))
+    native = native_picture(exif, width, height, whole=thermal)
+    long_side = round(max(native.width, native.height))
+    sensor = find_sensor(model=exif.text(tag.MODEL), long_side=long_side)
     thermal = thermal or (sensor is not None and sensor.band == "thermal") or _says_thermal(header)
-    found = read_calibration(
-        exif=exif, xmp=header.xmp, sensor=sensor, width=width, height=height, scale=scale
-    )
+    found = read_calibration(exif=exif, xmp=header.xmp, sensor=sensor, picture=native)
     focal = find_focal(
-        exif=exif,
-        sensor=sensor,
-        calibration=found.camera,
-        width=width,
-        height=height,
-        thermal=thermal,
+        exif=exif, sensor=sensor, calibration=found.camera, native=native, thermal=thermal
     )
     told = tuple(f"Its calibration was ignored: {n}." for n in found.nonsense)
-    notes = (note, *focal_notes(exif, sensor, width, height), *told)
+    notes = (native.note, *focal_notes(exif, sensor, native), *told)
     return _Lens(
         sensor=sensor,
         thermal=thermal,
         calibration=found.camera,
         nonsense=found.nonsense,
         focal=focal,
-        captured_mp=width * height / scale**2 / 1e6,
+        native=native,
         notes=notes,
     )
 

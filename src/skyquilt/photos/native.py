@@ -1,0 +1,115 @@
+"""The picture that a camera took, of which a file shows a reduced copy or a part.
+
+EXIF keeps the size that the camera wrote, also in copies by other programs. Focal lengths and
+calibrations of cameras refer to it.
+"""
+
+from dataclasses import dataclass, replace
+
+from skyquilt.model.camera import Camera
+from skyquilt.model.photo import Focal
+from skyquilt.photos import tags as tag
+from skyquilt.photos.tags import Exif
+
+_SAME = 0.02
+"""Sides or ratios of sides that differ by less are the same, but for rounding."""
+_WHOLE_PX = 0.75
+"""A part whose sides are more than this share of the picture's was hardly reduced besides."""
+_UNKNOWN = 0.25
+"""Deviation of a scale that nothing tells, as a share."""
+_CENTRE = 0.01
+"""Deviation of the principal point of a part, as a share of its longer side; pictures tell more."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Native:
+    """The picture that the camera took, and what a file shows of it."""
+
+    width: float
+    """In px as captured; so is `height`."""
+    height: float
+    file: tuple[int, int]
+    """Width and height of the file in px."""
+    scale: float = 1.0
+    """Px of the file per px as captured."""
+    sigma_scale: float = 0.0
+    """Its deviation as a share."""
+    part: bool = False
+    """Whether the file shows a part of it."""
+
+    @property
+    def note(self) -> str:
+        """What is said of a part."""
+        if not self.part:
+            return ""
+        sizes = "EXIF says {:.0f}x{:.0f} px, the file has {}x{}: cropped"
+        said = sizes.format(self.width, self.height, *self.file)
+        if not self.sigma_scale:
+            return f"{said}; its focal length is that of the whole picture."
+        return (
+            f"{said} or padded, so the focal length and any calibration in the metadata are"
+            " uncertain."
+        )
+
+    @property
+    def rows(self) -> float:
+        """Share of the picture's rows that the file shows."""
+        return min(1.0, self.file[1] / self.scale / self.height) if self.part else 1.0
+
+    def focal_of_file(self, focal: Focal) -> Focal:
+        """A focal length in px as captured, in px of the file."""
+        px = focal.px * self.scale
+        sigma = focal.sigma_px * self.scale
+        if self.sigma_scale:
+            sigma = (sigma**2 + (self.sigma_scale * px) ** 2) ** 0.5
+        return replace(focal, px=px, sigma_px=sigma)
+
+    def camera_of_file(self, camera: Camera) -> Camera:
+        """The lens of the picture as captured as that of the file. Nothing tells which part of the
+        picture one shows: its middle is taken.
+        """
+        width, height = self.file
+        if not self.part:
+            return camera.rescaled(width, height)
+        focal = self.focal_of_file(
+            Focal(
+                px=camera.focal,
+                sigma_px=camera.sigmas[0] if camera.sigmas else 0.0,
+                source="calibrated",
+            )
+        )
+        centre = _CENTRE * max(width, height)
+        sigmas = camera.sigmas and (focal.sigma_px, centre, centre, *camera.sigmas[3:])
+        return replace(
+            camera,
+            width=width,
+            height=height,
+            focal=focal.px,
+            cx=(width - 1) / 2,
+            cy=(height - 1) / 2,
+            sigmas=sigmas,
+        )
+
+
+def native_picture(exif: Exif, width: int, height: int, *, whole: bool = False) -> Native:
+    """The picture of which a file of `width` x `height` px is a copy or a part, as far as EXIF
+    tells. `whole`: it is no part, whatever EXIF says; a thermal frame beside its picture.
+    """
+    x, y = exif.number(tag.PIXELS_X), exif.number(tag.PIXELS_Y)
+    file = (width, height)
+    if not x or not y or not (1 <= x <= 1e6 and 1 <= y <= 1e6):
+        return Native(width=width, height=height, file=file)
+    scale = max(width, height) / max(x, y)
+    if whole or abs(min(width, height) / min(x, y) / scale - 1) <= _SAME:
+        return Native(width=width / scale, height=height / scale, scale=scale, file=file)
+    ways = [(width / across, height / down, across, down) for across, down in ((x, y), (y, x))]
+    as_written = [w for w in ways if abs(max(w[:2]) - 1) <= _SAME]
+    right, down, across, along = (as_written or ways)[0]
+    most = max(right, down)
+    if most > 1 + _SAME:  # padded, or enlarged along one side
+        sigma = min(_UNKNOWN, most - 1)
+    elif most > _WHOLE_PX:
+        scale, sigma = 1.0, 0.0 if as_written else 1 - most
+    else:
+        scale, sigma = most, _UNKNOWN
+    return Native(width=across, height=along, scale=scale, sigma_scale=sigma, part=True, file=file)
