@@ -23,9 +23,9 @@ from skyquilt.model.camera import ADJUSTABLE, PARAMETERS, Camera
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.poses import MapFrame, Motion, Pose, Prior
 from skyquilt.outside import real, whole
+from skyquilt.photos.capture import stated_shutter
 from skyquilt.photos.implausible_positions import on_sphere, sphere, with_coarse_deviations
 from skyquilt.photos.read import read_photo
-from skyquilt.photos.shutter import stated_shutter
 from skyquilt.photos.survey import capture_order
 
 FISHEYES = "fisheyes"

@@ -14,8 +14,8 @@ from skyquilt.model.camera import ADJUSTABLE, Camera
 from skyquilt.model.photo import Focal
 from skyquilt.outside import plain
 from skyquilt.photos import tags as tag
+from skyquilt.photos.capture import Native
 from skyquilt.photos.guesses import guessed_focal
-from skyquilt.photos.native import Native
 from skyquilt.photos.tags import Exif, Xmp
 
 

@@ -13,9 +13,10 @@ import numpy as np
 from skyquilt.engine.store import Store, digest
 from skyquilt.errors import UnreadablePhotoError
 from skyquilt.model.camera import Camera
-from skyquilt.model.photo import Focal, Photo, RejectedPhoto, Shutter, Stored
+from skyquilt.model.photo import Focal, Photo, RejectedPhoto, Stored
 from skyquilt.outside import MOST_MP, check_picture, open_regular, plain, whole
 from skyquilt.photos import tags as tag
+from skyquilt.photos.capture import Native, native_picture, part_of_shutter
 from skyquilt.photos.flir import MOST_THERMAL_MP
 from skyquilt.photos.headers import Header, content_digest, read_header
 from skyquilt.photos.lens import (
@@ -38,9 +39,7 @@ from skyquilt.photos.metadata import (
     read_time,
     read_velocity,
 )
-from skyquilt.photos.native import Native, native_picture
 from skyquilt.photos.pixels import read_tiff
-from skyquilt.photos.shutter import find_shutter
 from skyquilt.photos.thermal import (
     UNREAD,
     ThermalFrame,
@@ -228,22 +227,12 @@ def _photo(path: Path, name: str, header: Header, thermal_unit: str | None) -> P
         time=time,
         orientation_tag=whole(header.exif.tags.get(tag.ORIENTATION), 1, 8) or 1,
         rolling_shutter=rolling,
-        shutter=_shutter(header, lens.native, rolling),
+        shutter=part_of_shutter(header.exif.text(tag.MODEL), lens.native, rolling),
         velocity_ned=read_velocity(header.xmp),
         editor=find_editor(header.exif, header.xmp),
         coding="" if header.jpeg is None else header.jpeg.coding,
         notes=tuple(n for n in (*_broken_notes(header), *strange, *seen, *more) if n),
     )
-
-
-def _shutter(header: Header, native: Native, rolling: bool | None) -> Shutter:
-    """That of the rows that the file shows."""
-    megapixels = native.width * native.height / 1e6
-    found = find_shutter(header.exif.text(tag.MODEL), megapixels, rolling)
-    if found.source != "table":
-        return found
-    readout, sigma = found.readout_s * native.rows, found.sigma_s * native.rows
-    return replace(found, readout_s=readout, sigma_s=sigma)
 
 
 def _height(header: Header) -> float | None:

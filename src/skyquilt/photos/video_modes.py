@@ -12,8 +12,8 @@ from importlib.resources import files
 
 from skyquilt.model.clip import Clip
 from skyquilt.model.photo import Focal, Shutter
+from skyquilt.photos.capture import find_shutter, plain_model
 from skyquilt.photos.lens import find_sensor
-from skyquilt.photos.shutter import find_shutter, plain_model
 
 _SENSOR_SIGMA = 0.10
 """Of a focal length from the sensor: modes cut up to a fifth off the width."""

@@ -19,6 +19,7 @@ from skyquilt.model.photo import (
 from skyquilt.model.poses import MapFrame
 from skyquilt.ortho.orthomosaic import not_jpeg
 from skyquilt.outside import same_folder
+from skyquilt.photos.capture import stated_shutter
 from skyquilt.photos.detector_faults import Repair
 from skyquilt.photos.distances import read_distances
 from skyquilt.photos.gcp import check_control, read_gcp_list
@@ -27,7 +28,6 @@ from skyquilt.photos.lever_arm import with_lever_arm
 from skyquilt.photos.pixels import lost, read_color
 from skyquilt.photos.read import ReadPhoto, read_photo
 from skyquilt.photos.sequence import sequence_of
-from skyquilt.photos.shutter import stated_shutter
 from skyquilt.photos.survey import read_survey
 from skyquilt.photos.track_positions import is_track
 from skyquilt.settings import DEFAULTS, InputSettings, MosaicSettings

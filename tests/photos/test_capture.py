@@ -4,7 +4,7 @@ import piexif
 import pytest
 
 from skyquilt.model.camera import Camera
-from skyquilt.photos.native import native_picture
+from skyquilt.photos.capture import native_picture
 from skyquilt.photos.read import read_photo
 from skyquilt.photos.tags import PIXELS_X, PIXELS_Y, Exif
 

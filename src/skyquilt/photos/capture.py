@@ -1,16 +1,24 @@
-"""The picture that a camera took, of which a file shows a reduced copy or a part.
+"""How a camera took the picture of a file: its size, of which the file shows a reduced copy or a
+part, and how its rows were exposed, all at once or one after the other.
 
 EXIF keeps the size that the camera wrote, also in copies by other programs. Focal lengths and
 calibrations of cameras refer to it.
 """
 
+import csv
 from dataclasses import dataclass, replace
+from functools import cache
+from importlib.resources import files
 
 from skyquilt.model.camera import Camera
-from skyquilt.model.photo import Focal
+from skyquilt.model.photo import Focal, Shutter
 from skyquilt.photos import tags as tag
 from skyquilt.photos.tags import Exif
 
+_GUESS_S, _GUESS_SIGMA_S = 0.030, 0.015
+_UNKNOWN_SIGMA_S = 0.010
+_TABLE_SHARE = 0.10
+_OPTION_SHARE = 0.03
 _SAME = 0.02
 """Sides or ratios of sides that differ by less are the same, but for rounding."""
 _WHOLE_PX = 0.75
@@ -113,3 +121,62 @@ def native_picture(exif: Exif, width: int, height: int, *, whole: bool = False) 
     else:
         scale, sigma = most, _UNKNOWN
     return Native(width=across, height=along, scale=scale, sigma_scale=sigma, part=True, file=file)
+
+
+@cache
+def _table() -> dict[str, tuple[tuple[float, float], ...]]:
+    """Model in plain letters -> (megapixels below which the row applies, readout in s)."""
+    text = files("skyquilt.photos").joinpath("shutters.csv").read_text("utf-8")
+    table: dict[str, tuple[tuple[float, float], ...]] = {}
+    for row in csv.DictReader(text.splitlines()):
+        key = plain_model(row["model"])
+        entry = (float(row["below_mp"] or "inf"), float(row["readout_ms"]) / 1000)
+        table[key] = (*table.get(key, ()), entry)
+    return table
+
+
+def plain_model(text: str) -> str:
+    """A camera model's name without case, spaces and signs, as tables are searched."""
+    return "".join(c for c in text.lower() if c.isalnum())
+
+
+def find_shutter(model: str, megapixels: float, rolling: bool | None) -> Shutter:
+    """What is known of the shutter of a camera model.
+
+    Args:
+        model: as in EXIF.
+        megapixels: of the photo as captured.
+        rolling: what the sensor table says; None where it says nothing.
+
+    The readout times of `shutters.csv` are those listed by OpenDroneMap (`rollingshutter.py`),
+    measured by its users; they are taken to be right within a tenth.
+    """
+    if rolling is False:
+        return Shutter(readout_s=0.0, sigma_s=0.0, source="global")
+    for below, readout in _table().get(plain_model(model), ()):
+        if megapixels < below:
+            return Shutter(readout_s=readout, sigma_s=_TABLE_SHARE * readout, source="table")
+    if rolling:
+        return Shutter(readout_s=_GUESS_S, sigma_s=_GUESS_SIGMA_S, source="guess")
+    return Shutter(readout_s=0.0, sigma_s=_UNKNOWN_SIGMA_S, source="unknown")
+
+
+def stated_shutter(kind: str | None, readout_ms: float | None) -> Shutter | None:
+    """The shutter that a user states by `--shutter` and `--shutter-readout`; None for neither."""
+    if readout_ms is None:
+        if kind == "rolling":
+            return Shutter(readout_s=_GUESS_S, sigma_s=_GUESS_SIGMA_S, source="guess")
+        return None if kind != "global" else Shutter(readout_s=0.0, sigma_s=0.0, source="option")
+    seconds = readout_ms / 1000
+    return Shutter(readout_s=seconds, sigma_s=_OPTION_SHARE * seconds, source="option")
+
+
+def part_of_shutter(model: str, native: Native, rolling: bool | None) -> Shutter:
+    """What is known of the shutter of a camera model, for the rows that a file shows of its
+    picture; `rolling`: see `find_shutter`.
+    """
+    found = find_shutter(model, native.width * native.height / 1e6, rolling)
+    if found.source != "table":
+        return found
+    readout, sigma = found.readout_s * native.rows, found.sigma_s * native.rows
+    return replace(found, readout_s=readout, sigma_s=sigma)
