@@ -73,6 +73,29 @@ def test_frames_of_variable_rate_are_found_by_their_times(clip, tmp_path):
     assert [number_of(frame_of(path, times[i])) for i in (140, 20, 90, 75)] == [140, 20, 90, 75]
 
 
+@pytest.mark.parametrize("shape", [(4, 3), (8, 9), (1, 1), (100, 1)])
+@pytest.mark.parametrize("grey", [False, True])
+def test_oblong_pixels_are_made_square(clip, tmp_path, shape, grey):
+    """As the file says; what no camera has is an error of the file."""
+    data = bytearray(clip.read_bytes())
+    entry = data.index(b"stsd") + 12
+    (length,) = struct.unpack(">I", data[entry : entry + 4])
+    data[entry + length : entry + length] = struct.pack(">I4sII", 16, b"pasp", *shape)
+    data[entry : entry + 4] = struct.pack(">I", length + 16)
+    _grow(data, (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd"), 16)
+    path = tmp_path / "oblong.mp4"
+    path.write_bytes(data)
+    square, oblong = Decoder(clip, grey=grey), Decoder(path, grey=grey)
+    ratio = shape[0] / shape[1] if shape[0] < 10 else 1.0
+    assert oblong.width == round(SIZE[0] * max(1, ratio))
+    assert oblong.height == round(SIZE[1] / min(1, ratio))
+    seen, before = oblong.at(1.0)[1], square.at(1.0)[1]
+    assert seen.shape[:2] == (oblong.height, oblong.width)
+    assert np.abs(seen.mean((0, 1)) - before.mean((0, 1))).max() < 0.5
+    read = read_clip(path, name="oblong.mp4")
+    assert (read.width, read.height) == (oblong.width, oblong.height)
+
+
 def _grow(data, boxes, by):
     for name in boxes:
         at = data.index(name) - 4

@@ -1,7 +1,8 @@
 """Decodes frames of clips by OpenCV: one decoder per clip, which seeks.
 
 A frame is named by its time, because frame numbers do not tell where a frame is in a clip of
-variable frame rate. Pixels are in sensor coordinates: rotation flags are not applied.
+variable frame rate. Pixels are in sensor coordinates: rotation flags are not applied. Those of
+recordings with oblong pixels (analog cameras, HDV) are made square, as players show them.
 """
 
 import os
@@ -24,6 +25,8 @@ _AHEAD = 30
 sixteenth frame before, and decodes all from there.
 """
 _TOLERANCE = 0.4
+_OBLONG = (0.3, 3.0)
+"""Ratios of width to height that pixels may have; others are errors of the file."""
 _PLANAR = int.from_bytes(b"I420", "little")
 """Pixel format whose first plane is the brightness in 8 bits: 8-bit H.264, H.265 and MPEG-4."""
 Frame = NDArray[np.uint8]
@@ -53,8 +56,14 @@ class Decoder:
         fps = float(cap.get(cv2.CAP_PROP_FPS))
         self.fps = fps if 0.1 <= fps <= 1000 else 30.0
         self.frames = max(int(cap.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
-        self.width = int(cap.get(cv2.CAP_PROP_FRAME_WIDTH))
-        self.height = int(cap.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        width = int(cap.get(cv2.CAP_PROP_FRAME_WIDTH))
+        height = int(cap.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        across = cap.get(cv2.CAP_PROP_SAR_NUM) / (cap.get(cv2.CAP_PROP_SAR_DEN) or 1.0)
+        if not _OBLONG[0] < across < _OBLONG[1]:
+            across = 1.0
+        self.width = round(width * max(across, 1.0))
+        self.height = round(height / min(across, 1.0))
+        self._oblong = (width, height) != (self.width, self.height)
         self.rotation_deg = int(cap.get(cv2.CAP_PROP_ORIENTATION_META))
         code = int(cap.get(cv2.CAP_PROP_FOURCC))
         self.codec = "".join(chr(code >> 8 * i & 255) for i in range(4)).strip("\0 ")
@@ -82,6 +91,8 @@ class Decoder:
         if not self._plane:
             code = cv2.COLOR_BGR2GRAY if self._grey else cv2.COLOR_BGR2RGB
             pixels = cv2.cvtColor(pixels, code)
+        if self._oblong:
+            pixels = cv2.resize(pixels, (self.width, self.height))
         return self._time, np.asarray(pixels, dtype=np.uint8)
 
     def skip(self) -> bool:
