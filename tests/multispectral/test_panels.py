@@ -34,13 +34,15 @@ def sun(name, time_s):
 def take(tmp_path):
     """Takes the files of both bands: the index of those with a panel, and what the sun sensor
     reads over the truth, by band; None: there is none. `level`: reflectance at the panel's place,
-    `lying`: of something across it, `place`: its corners.
+    `lying`: of something across it, `place`: its corners, `shadow`: files with a shadow on it.
     """
 
-    def files(sensor=None, panels=(0, 3), level=None, lying=None, place=PLACE):
+    def files(
+        sensor=None, panels=(0, 3), level=None, lying=None, place=PLACE, shadow=(), times=TIMES_S
+    ):
         found = []
         for name, nm in (("red", 668), ("nir", 842)):
-            for k, time_s in enumerate(TIMES_S):
+            for k, time_s in enumerate(times):
                 told = {"Camera__BandName": name, "Camera__CentralWavelength": str(nm)}
                 told["MicaSense__CaptureId"] = f"capture{k}"
                 told |= dict.fromkeys(("DLS__SpectralIrradiance", "DLS__HorizontalIrradiance"))
@@ -49,7 +51,7 @@ def take(tmp_path):
                 share = SHARE.copy()
                 if k in panels:
                     told |= {"Camera__Albedo": str(PANEL[name]), "Camera__ReflectArea": place}
-                    share[25:85, 60:116] = (level or PANEL)[name]
+                    share[25:85, 60:116] = (level or PANEL)[name] * (0.35 if k in shadow else 1)
                     if lying:
                         share[50:60] = lying
                 path = tmp_path / f"IMG_{k}_{name}.tif"
@@ -99,6 +101,22 @@ def test_a_sun_sensor_is_corrected(take, sensor, words):
     bands, note = by_panels(placed, shot)
     assert_allclose(errors(bands), 1, rtol=0.003)
     assert words in note.text and note.warning == ("far off" in words)
+
+
+@pytest.mark.parametrize("sensor", [None, {"red": 0.8, "nir": 1.2}])
+@pytest.mark.parametrize("shadow", [0, 3])
+def test_of_two_pictures_of_one_moment_the_one_without_a_shadow_counts(take, sensor, shadow):
+    """It was the later one, or the mean of both: 2.9 or 1.5 times too bright, without a word."""
+    placed, shot = take(sensor, shadow=(shadow,), times=(0, 20, 30, 5))
+    bands, note = by_panels(placed, shot)
+    assert_allclose(errors(bands), 1, rtol=0.04)
+    assert f"times as much light as by IMG_{shadow}_" in note.text and note.warning
+
+
+def test_pictures_of_a_panel_that_contradict_each_other_are_told(take):
+    placed, shot = take(panels=(0, 3), shadow=(3,))
+    _, note = by_panels(placed, shot)
+    assert "as much light as by IMG_3_" in note.text and note.warning
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """Seam points on drawn label maps; seam disparity of photos that disagree by a known amount."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,7 +9,7 @@ from hypothesis import strategies as st
 
 from skyquilt.quality import seam_points as seam_points_module
 from skyquilt.quality.seam_points import SeamPoint, seam_points
-from skyquilt.quality.seams import PatchPairs, seam_disparity
+from skyquilt.quality.seams import PatchPairs, noise_of, seam_disparity
 from tests.texture import seen, texture
 
 
@@ -137,6 +139,19 @@ def test_failures_are_attempted_and_blind_points_are_not():
     assert all(s.reason for s in report.samples if not s.ok)
     assert report.median_px == pytest.approx(np.sqrt(2), abs=0.03)
     assert report.stands
+
+
+@pytest.mark.parametrize("unit", [0.002, 0.1, 50.0])
+def test_measured_values_of_any_unit_have_the_figures_of_grey_ones(unit):
+    """Degrees of level ground, of warm roofs, counts; where nothing was measured, there is none."""
+    points, source = points_of(60), shifted((6, -8), flat=10, unseen=5)
+    grey = source(points)
+    values = replace(grey, a=np.float32(unit) * grey.a + 10, b=np.float32(unit) * grey.b + 10)
+    values.a[11, 0, 0] = np.nan
+    report = seam_disparity(points, values, gsd_m=0.02, noise=noise_of(values))
+    assert (report.measured, report.attempted) == (44, 44)
+    assert report.median_px == pytest.approx(2.5, abs=0.03)
+    assert noise_of(replace(values, seen=np.zeros(60, bool))) > 0
 
 
 def test_a_disparity_beyond_the_search_is_a_failure_not_a_small_figure():

@@ -15,6 +15,9 @@ own gradient.
 """
 RIM = 2
 """Width in px of a patch's border where its gradient is not used."""
+_PLAIN = 0.6745
+"""Median of the absolute value of a normal variable, in standard deviations."""
+_LAPLACIANS = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 _DERIVE = np.array([-1, -2, 0, 2, 1], np.float32) / 8
 _SMOOTH = np.array([1, 4, 6, 4, 1], np.float32) / 16
 
@@ -61,6 +64,14 @@ def has_texture(patches: NDArray[Any], *, noise: float = NOISE) -> NDArray[np.bo
     """
     of_noise = noise * float(np.linalg.norm(_DERIVE) * np.linalg.norm(_SMOOTH))
     return weakest_gradient(patches) > TEXTURE * of_noise
+
+
+def noise_in(values: NDArray[Any]) -> float:
+    """Standard deviation of the noise of values (h, w), in their unit: the median of Immerkaer's
+    (1996) difference of Laplacians, which edges hardly change.
+    """
+    rest = np.abs(cv2.filter2D(values.astype(np.float32, copy=False), cv2.CV_32F, _LAPLACIANS))
+    return float(np.median(rest)) / _PLAIN / float(np.linalg.norm(_LAPLACIANS))
 
 
 @lru_cache(maxsize=8)

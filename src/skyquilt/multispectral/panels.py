@@ -29,19 +29,28 @@ _UNEVEN = 0.15
 """Standard deviation of a panel's pixels, as a share of their mean, from which something lies on
 it, or it lies elsewhere."""
 _DIFFERS = 1.5
-"""Factor between panel and sun sensor from which it is told."""
+"""Factor between panel and sun sensor, or between pictures of a panel, from which it is told."""
+_TOGETHER_S = 60.0
+"""Pictures of a panel within so many seconds show it in one light."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Seen:
     """What one file with a panel tells."""
 
+    name: str
+    """Its name."""
     time_s: float
     """When it was taken; NaN: not known."""
     light: float
     """Irradiance in which the panel has its reflectance."""
     sensor: float | None
     """That of the sun sensor, in its own unit."""
+
+    @property
+    def over_sensor(self) -> float:
+        """The light over what the sun sensor measured; the light where there is no sensor."""
+        return self.light / (self.sensor or 1.0)
 
 
 def by_panels(
@@ -51,7 +60,8 @@ def by_panels(
     what to tell of it. `shot`: all files of all bands, those that are not drawn too.
 
     Where files have readings of a sun sensor, these are multiplied by what panels measure over them
-    (median); else the light of a file is that between the panels before and after it.
+    (median); else the light of a file is that between the panels before and after it. Of pictures
+    taken within a minute the brightest counts: who stands beside a panel darkens some.
     """
     light = [b.files.name for b in placed if b.files.name != THERMAL]
     with_panel = [b for b in shot if any(t.panel for t in b.tags)]
@@ -81,20 +91,31 @@ def by_panels(
         if one.files.name == THERMAL:
             bands.append(one)
             continue
-        converts, factor = _lit(one.files, seen[one.files.name])
+        converts, factor = _lit(one.files, _brightest(seen[one.files.name]))
         bands.append(replace(one, files=replace(one.files, converts=converts)))
         factors += [factor] if factor else []
-    return bands, _note(max(map(len, seen.values())), factors)
+    return bands, _note([seen[name] for name in light], factors)
 
 
-def _note(pictures: int, factors: Sequence[float]) -> Note:
-    """What is told; `factors`: panel over sun sensor, by band, where that measures irradiances."""
+def _note(seen: Sequence[Sequence[_Seen]], factors: Sequence[float]) -> Note:
+    """What is told; `seen`: by band, `factors`: panel over sun sensor, by band, where that measures
+    irradiances.
+    """
+    pictures = max(map(len, seen))
     many = f"{pictures} pictures" if pictures > 1 else "a picture"
     told = f"Values are reflectances by {many} of a panel"
-    if not factors:
-        return Note(text=f"{told}.")
-    low, high = min(factors), max(factors)
-    told += f" and the sun sensor, whose readings are multiplied by {low:.2f} to {high:.2f}"
+    low, high = min(factors, default=1.0), max(factors, default=1.0)
+    if factors:
+        told += f" and the sun sensor, whose readings are multiplied by {low:.2f} to {high:.2f}"
+    ordered = [sorted(own, key=lambda s: s.over_sensor) for own in seen]
+    dark, bright = max(((o[0], o[-1]) for o in ordered), key=lambda e: _times(*e))
+    if _times(dark, bright) > _DIFFERS:
+        return Note(
+            text=f"{told}. By {bright.name} there was {_times(dark, bright):.1f} times as much light"
+            f" as by {dark.name}: there was a cloud, or a shadow on the panel or the sensor. Take"
+            " away pictures of a panel in a shadow.",
+            warning=True,
+        )
     if low > 1 / _DIFFERS and high < _DIFFERS:
         return Note(text=f"{told}.")
     return Note(
@@ -104,12 +125,33 @@ def _note(pictures: int, factors: Sequence[float]) -> Note:
     )
 
 
+def _times(dark: _Seen, bright: _Seen) -> float:
+    """How many times as much light the latter tells as the former."""
+    return bright.over_sensor / dark.over_sensor
+
+
+def _brightest(seen: Sequence[_Seen]) -> list[_Seen]:
+    """Of pictures taken within a minute the one that tells most light, in order of time; those of
+    unknown time are one such group.
+    """
+    groups: list[list[_Seen]] = []
+    for one in sorted(seen, key=lambda s: (math.isnan(s.time_s), s.time_s)):
+        since = one.time_s - groups[-1][0].time_s if groups else math.inf
+        untimed = bool(groups) and math.isnan(one.time_s) and math.isnan(groups[-1][0].time_s)
+        if since <= _TOGETHER_S or untimed:
+            groups[-1].append(one)
+        else:
+            groups.append([one])
+    return [max(group, key=lambda s: s.over_sensor) for group in groups]
+
+
 def _lit(files: BandFiles, seen: Sequence[_Seen]) -> tuple[tuple[Reflectance, ...], float | None]:
     """How a band's counts become reflectances, and the factor of the sun sensor's readings, None
     where there is no sensor that measures irradiances.
     """
-    both = [s.light / s.sensor for s in seen if s.sensor]
-    factor = float(np.median(both)) if both else None
+    both = [s.over_sensor for s in seen if s.sensor]
+    # of two in the middle the larger one: a shadow makes it too small
+    factor = float(np.quantile(both, 0.5, method="higher")) if both else None
     times, light = np.array([(s.time_s, s.light) for s in seen]).T
     timed = np.isfinite(times)
     order = np.flatnonzero(timed)[np.argsort(times[timed], kind="stable")]
@@ -149,7 +191,7 @@ def _look(photo: Photo, tags: BandTags, convert: Reflectance, time_s: float) -> 
     if not mean > 0 or values.std() > _UNEVEN * mean:
         return f"that in {photo.name} is not evenly bright"
     light = math.pi * mean / tags.panel.reflectance
-    return _Seen(time_s=time_s, light=light, sensor=convert.irradiance)
+    return _Seen(name=photo.name, time_s=time_s, light=light, sensor=convert.irradiance)
 
 
 def _inside(panel: Panel, shape: tuple[int, ...]) -> NDArray[np.bool_]:

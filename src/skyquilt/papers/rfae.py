@@ -19,6 +19,7 @@ from skyquilt.coregistration.methods import INLIERS, SAMPLES
 from skyquilt.coregistration.orientation import Pyramid
 from skyquilt.coregistration.structure import sharpened
 from skyquilt.coregistration.usable import both_usable
+from skyquilt.imaging.gradients import noise_in
 from skyquilt.imaging.grey import to_grey8
 from skyquilt.matching.matchers import OneWay
 from skyquilt.matching.ransac import Ransac
@@ -45,8 +46,6 @@ or a hot object, and leaves no edges elsewhere.
 """
 FALSE_EDGES = 0.01
 """Share of the pixels of plain noise that the threshold from the sensor's noise takes for edges."""
-_PLAIN = 0.6745
-"""Median of the absolute value of a normal variable, in standard deviations."""
 
 
 def gradient_magnitude(values: NDArray[Any], largest: float = LARGEST) -> NDArray[np.float32]:
@@ -65,14 +64,10 @@ def noise_threshold(values: NDArray[Any], largest: float = LARGEST) -> float:
     """The gradient that noise alone exceeds in `FALSE_EDGES` of the pixels, in units of
     `gradient_magnitude`: the thesis's threshold from the statistics of a sensor [Y 5.2.2].
 
-    The noise is the median of Immerkaer's (1996) difference of Laplacians, which edges hardly
-    change; a gradient of normal noise has a Rayleigh distribution.
+    A gradient of normal noise has a Rayleigh distribution.
     """
     grey = to_grey8(values).astype(np.float32)
-    kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
-    rest = np.abs(cv2.filter2D(grey, cv2.CV_32F, kernel))
-    sigma = float(np.median(rest)) / _PLAIN / 6  # the kernel's norm
-    gradient = sigma * np.sqrt(12) / 4  # Sobel's norm, with its factor 1/4
+    gradient = noise_in(grey) * np.sqrt(12) / 4  # Sobel's norm, with its factor 1/4
     x = cv2.Sobel(grey, cv2.CV_32F, 1, 0, scale=0.25)
     y = cv2.Sobel(grey, cv2.CV_32F, 0, 1, scale=0.25)
     scale = float(np.percentile(np.hypot(x, y), largest))

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.engine.workers import HERE, Workers
+from skyquilt.imaging.gradients import NOISE
 from skyquilt.ortho.companions import Drawn
 from skyquilt.ortho.compose import Composer
 from skyquilt.ortho.ground import Ground
@@ -15,7 +16,7 @@ from skyquilt.ortho.orthomosaic import used_photos
 from skyquilt.quality.seam_look import cut_objects, seam_colours
 from skyquilt.quality.seam_points import SeamPoint, seam_points
 from skyquilt.quality.seam_views import Look, views_at
-from skyquilt.quality.seams import SeamReport, seam_disparity
+from skyquilt.quality.seams import SeamReport, noise_of, seam_disparity
 
 SHOWN, APART = 3, 100
 """Number of the worst places that are shown, and their least distance in px of the provenance."""
@@ -52,7 +53,8 @@ def measure_seams(
         gsd=ground.grid.gsd,
     )
     found = views_at(points, drawn.provenance_grid, views, look, workers)
-    report = seam_disparity(points, found.pairs, gsd_m=ground.native_gsd)
+    noise = NOISE if compose.dtype == np.uint8 else noise_of(found.pairs)
+    report = seam_disparity(points, found.pairs, gsd_m=ground.native_gsd, noise=noise)
     looks: dict[str, Any] = {"seam_colour_step": None, "seam_cut_objects": None, "hidden_m2": None}
     worst: list[SeamPoint] = []
     if found.lab is not None and points:

@@ -8,12 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.gradients import NOISE, has_texture
+from skyquilt.imaging.gradients import NOISE, has_texture, noise_in
 from skyquilt.imaging.registration import RADIUS, shifts_between
 from skyquilt.quality.seam_points import SeamPoint
 
 LEAST_MEASURED = 0.6
 """Share of the attempted points that must be measured for the figures to be reliable."""
+SMOOTH = 10.0
+"""Percentile of the patches, by their noise, that tells that of measured values: texture of a pixel
+looks like noise.
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -75,6 +79,20 @@ class SeamReport:
     def stands(self) -> bool:
         """Whether enough of the attempted points were measured for the figures to be reliable."""
         return self.measured > 0 and self.measured >= LEAST_MEASURED * self.attempted
+
+
+def noise_of(pairs: PatchPairs) -> float:
+    """Standard deviation of the noise of measured values (degrees, counts, reflectances), from
+    patches of them: that of the tenth of the patches that show least, at least what it would be of
+    a picture of 0 to 255 to which they are stretched between their 1st and 99th percentile.
+    """
+    shown = np.concatenate([pairs.a[pairs.seen], pairs.b[pairs.seen]])
+    shown = shown[np.isfinite(shown).all((1, 2))]
+    if not len(shown):
+        return NOISE
+    low, high = np.percentile(shown, [1, 99])
+    plain = float(np.percentile([noise_in(patch) for patch in shown], SMOOTH))
+    return max(plain, NOISE * float(high - low) / 255)
 
 
 def seam_disparity(
