@@ -138,14 +138,14 @@ def test_counts_that_are_no_radiance_are_nan():
     assert np.isfinite(celsius[0, 1])
 
 
-def dji_jpeg(tmp_path, counts, short=0):
+def dji_jpeg(tmp_path, counts, short=0, name="t.jpg"):
     exif = {"0th": {0x010F: "DJI", 0x0110: "MAVIC2-ENTERPRISE-ADVANCED"}}
     data = jpeg_bytes(pixels(counts.shape[1], counts.shape[0]), exif)
     raw = counts.astype("<u2").tobytes()[: -short or None]
     for i in reversed(range(0, len(raw), 65532)):
         data = with_segment(data, 0xE3, raw[i : i + 65532])
-    (tmp_path / "t.jpg").write_bytes(data)
-    return read_photo(tmp_path / "t.jpg")
+    (tmp_path / name).write_bytes(data)
+    return read_photo(tmp_path / name)
 
 
 def test_dji_counts_come_back_and_the_palette_does_not(tmp_path):
@@ -538,6 +538,21 @@ def test_colours_without_temperatures_are_told(tmp_path):
     dji_jpeg(tmp_path, counts)
     told = " ".join(read_survey(tmp_path).notes)
     assert "palette" not in told and "raw data" not in told
+
+
+@pytest.mark.parametrize("plain", [1, 2, 3])
+def test_measurements_beside_as_many_palettes_are_mapped_as_the_colours_they_hold(tmp_path, plain):
+    """Half of a flight had been left out: of frames taken in turns, every other one."""
+    counts = np.full((512, 640), 7000, np.uint16)
+    for k in range(4):
+        dji_jpeg(tmp_path, counts + k, short=2 * (k < plain), name=f"{k}.jpg")
+    survey = read_survey(tmp_path)
+    colours = [read_color(p).shape == (512, 640, 3) for p in survey.photos]
+    assert colours == ([True] * 4 if plain > 1 else [True, False, False, False])
+    told = " ".join(survey.notes)
+    assert (f"{4 - plain} thermal photos hold measurements, {plain}.jpg" in told) == (plain > 1)
+    last = survey.photos[3]
+    assert (last.pixels_key == read_photo(last.path).pixels_key) == (plain == 1)
 
 
 def test_copying_again_is_advised_for_damaged_files_only(tmp_path):

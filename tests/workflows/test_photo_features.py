@@ -63,9 +63,15 @@ def test_degrees_and_counts_are_not_one_kind():
     focal = Focal(px=700.0, sigma_px=70.0, source="guess")
     units = ["celsius", "counts", "celsius"]
     photos = [Photo(name=f"{k}", unit=u, focal=focal, **common) for k, u in enumerate(units)]
-    found = of_one_kind(
-        FeaturedPhotos(photos=tuple(photos), number=(0, 1, 2), look=None, looks=None, rejected=())
-    )
+
+    def of_one(number):
+        given = tuple(photos[k] for k in number)
+        return of_one_kind(
+            FeaturedPhotos(photos=given, number=number, look=None, looks=None, rejected=())
+        )
+
+    assert [p.name for p in of_one((0, 1)).photos] == ["0"]  # a conversion beside its source
+    found = of_one((0, 1, 2))
     assert [p.name for p in found.photos] == ["0", "2"]
     (left,) = found.rejected
     assert left.name == "1" and "thermal in counts" in left.reason

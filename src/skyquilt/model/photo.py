@@ -240,9 +240,11 @@ class Photo:
 
     @property
     def pixels_key(self) -> str:
-        """Stands for its pixels as they are read: the digest of its file, and what is mended."""
+        """Stands for its pixels as they are read: the digest of its file, what values mean, and
+        what is mended.
+        """
         faults = "" if self.faults is None else self.faults.key
-        return "-".join(part for part in (self.digest, self.stored, faults) if part)
+        return "-".join(part for part in (self.digest, self.stored or self.unit, faults) if part)
 
     @property
     def lens_guessed(self) -> bool:

@@ -41,7 +41,7 @@ from skyquilt.photos.recoded import UNNAMED, recoded
 from skyquilt.photos.side_files import apply_positions
 from skyquilt.photos.side_rows import sentence_of
 from skyquilt.photos.thermal import UNREAD
-from skyquilt.photos.thermal_units import in_one_unit, unit_notes
+from skyquilt.photos.thermal_units import in_one_unit, in_palettes, unit_notes
 from skyquilt.settings import InputSettings
 from skyquilt.video.read import CLIP_ENDINGS, side_files
 
@@ -195,6 +195,7 @@ def read_survey(
     if cameras and not films:  # those of clips are known with their frames
         photos, more = apply_cameras(photos, calibrated, file=cameras)
         notes = (*notes, *more)
+    photos, painted = in_palettes(photos)
     photos, greyed = _in_colour(_with_editors(photos))
     photos, implausible = placed_plausibly(photos)
     return Survey(
@@ -211,6 +212,7 @@ def read_survey(
             *notes_on_files(
                 found, placeless=side is None and any(p.position is None for p in photos)
             ),
+            *painted,
             *greyed,
             *implausible,
             *survey_notes(photos, len(copies) + len(reduced)),

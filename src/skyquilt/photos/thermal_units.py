@@ -1,4 +1,4 @@
-"""One unit for all thermal TIFFs of a camera, and what is said of units."""
+"""One unit, and one kind of pixels, for all thermal files of a camera; what is said of units."""
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
@@ -63,6 +63,31 @@ def _common(units: Sequence[Stored]) -> Stored:
         return "centicelsius"
     del found["counts"]
     return found.most_common(1)[0][0]
+
+
+def in_palettes(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
+    """The photos; radiometric JPEGs of a camera of which as many hold a palette's colours alone are
+    read as the pictures that they hold, too, so that one map shows all; and a note on these.
+    """
+    cameras: dict[str, list[Photo]] = defaultdict(list)
+    for photo in photos:
+        if photo.band == "thermal" and photo.coding:
+            cameras[photo.camera_key].append(photo)
+    shown: dict[str, Photo] = {}
+    for own in cameras.values():
+        measured, plain = [p for p in own if p.unit], [p for p in own if not p.unit]
+        if len(measured) <= len(plain):
+            channels = plain[0].channels
+            shown |= {
+                p.name: replace(p, unit="", dtype="uint8", channels=channels) for p in measured
+            }
+    if not shown:
+        return tuple(photos), ()
+    return tuple(shown.get(p.name, p) for p in photos), (
+        f"{len(shown)} thermal photos hold measurements, {min(shown)} for one, but as many or more"
+        " of their camera a palette's colours alone: the colours of all are mapped. For a map of"
+        " measurements, map those photos by themselves.",
+    )
 
 
 def unit_notes(photos: Sequence[Photo]) -> Iterator[str]:
