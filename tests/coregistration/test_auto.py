@@ -89,6 +89,18 @@ def test_parts_are_found_both_ways(auto, shape):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("stretch", [1.33, 0.75])
+def test_pixels_that_are_longer_than_wide_are_found(auto, stretch):
+    """A video of 1440 x 1080 px, which is to be shown as 1920, and its frames."""
+    truth = turned(1.0, 15.0, SMALL, SMALL)
+    truth = np.array([[stretch, 0, (1 - stretch) * SMALL[1] / 2], [0, 1, 0], [0, 0, 1]]) @ truth
+    a, b = pair(truth, SMALL, seed=8, shape_a=SMALL)
+    found = auto(Picture(values=a), Picture(values=b))
+    assert found and found.model == "affine"
+    assert 1e-4 < error(found.b_H_a, truth, SMALL) < 0.3
+
+
+@pytest.mark.slow
 def test_reversed_contrast_changes_nothing(auto):
     truth = turned(1.0, 20.0, SMALL, SMALL)
     a, _ = pair(np.eye(3), SMALL, seed=5, shape_a=SMALL)

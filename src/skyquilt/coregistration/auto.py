@@ -11,7 +11,7 @@ from skyquilt.coregistration.common_part import common_part
 from skyquilt.coregistration.decision import Decide, distinctness
 from skyquilt.coregistration.everywhere import Everywhere
 from skyquilt.coregistration.orientation import Orientation, Pyramid, full_size, orientation
-from skyquilt.coregistration.structure import StructureMatches, sharpened
+from skyquilt.coregistration.structure import Proposal, StructureMatches, sharpened
 from skyquilt.coregistration.subpixel import Fit, SubpixelRefinement
 from skyquilt.coregistration.usable import Usable, both_usable
 from skyquilt.model.registration import Guess, Matrix, Outcome, Picture, RefusedRegistration
@@ -54,7 +54,7 @@ class Auto:
     """Agreement above which nothing else is tried."""
     beyond: bool = True
     """Whether everything is searched where a guess is not confirmed."""
-    version: ClassVar[int] = 6
+    version: ClassVar[int] = 7
 
     def __call__(self, a: Picture, b: Picture, guess: Guess | None = None) -> Outcome:
         """The registration of b to a, or the reason why there is none.
@@ -70,7 +70,8 @@ class Auto:
         if isinstance(pictures, RefusedRegistration):
             return pictures
         pyramid = Pyramid(a=pictures[0], b=pictures[1], sides=self.sides)
-        matched = self.propose(*pictures).b_H_a
+        proposed = self.propose(*pictures)
+        matched = proposed.b_H_a
         first = [] if matched is None else [sharpened(pyramid, matched, _SELECT)]
         found = self.decide(pyramid, first)
         if found.evidence.get("surprise", 0.0) >= self.sure:
@@ -79,7 +80,7 @@ class Auto:
         found = self.decide(pyramid, first + self._best(pyramid, places))
         if found.evidence.get("surprise", 0.0) >= self.decide.least_surprise:
             return found
-        return self._in_part(a, b, pictures) or found
+        return self._stretched(pyramid, proposed) or self._in_part(a, b, pictures) or found
 
     def _guided(self, a: Picture, b: Picture, guess: Guess, *, told: bool = False) -> Outcome:
         """The decision in the neighbourhood of a guess, on the part that both images then share;
@@ -93,6 +94,12 @@ class Auto:
         fits = self._best(pyramid, self._near(pyramid, part.guess))
         reach = part.guess.reach * max(pyramid.at(_DECIDE)[1].shape)
         return part.whole(self.decide(pyramid, fits, reach, told=told))
+
+    def _stretched(self, pyramid: Pyramid, proposed: Proposal) -> Outcome:
+        """The decision where pixels of one image are longer than wide."""
+        matched = proposed.stretched()
+        fits = [] if matched is None else [sharpened(pyramid, matched, _SELECT, "affine")]
+        return self.decide(pyramid, fits)
 
     def _in_part(self, a: Picture, b: Picture, pictures: tuple[Usable, Usable]) -> Outcome:
         """The decision where one image shows a part of the other only, of an eighth to a half of

@@ -105,14 +105,14 @@ class Decide:
         where none can fit.
         """
         a, b = pyramid.at(pyramid.last)
-        model: Freedom = "similarity"
+        model = fit.freedom
         corners = overlap_corners(fit.b_H_a, a.shape, b.shape)
         freer = SubpixelRefinement(freedom="homography")(a, b, fit.b_H_a)
         if freer.correlation > (1 + self.gain) * fit.correlation:
             scatter = self._scatter(agreement.every, corners, b.shape, model)
             change = transfer(freer.b_H_a @ np.linalg.inv(fit.b_H_a), corners) - corners
             if self.state.determined(scatter, change, corners) > self.determined:
-                model, fit = "homography", freer
+                model, fit = freer.freedom, freer
                 agreement = self.agree(a, b, fit.b_H_a)
         full, error = self._closer(pyramid, fit, model)
         to_full = np.linalg.inv(b.small_S_full)

@@ -1,6 +1,6 @@
 """Ways to register two pictures of different spectra, by name."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from skyquilt import registry
 from skyquilt.coregistration.auto import Auto
@@ -84,8 +84,7 @@ def shapes() -> WithoutMarks:
 
 
 def _proposals() -> StructureMatches:
-    return StructureMatches(
-        estimate=Ransac(
-            model="similarity", minimum=INLIERS, threshold_px=4.0, max_iterations=5 * SAMPLES
-        )
+    similar = Ransac(
+        model="similarity", minimum=INLIERS, threshold_px=4.0, max_iterations=5 * SAMPLES
     )
+    return StructureMatches(estimate=similar, stretch=replace(similar, model="affine"))

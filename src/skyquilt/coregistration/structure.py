@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from skyquilt.coregistration.decision import Decide
 from skyquilt.coregistration.index_features import IndexFeatures, index_features, mutual, phase
 from skyquilt.coregistration.orientation import Pyramid, shrunken
-from skyquilt.coregistration.subpixel import Fit, SubpixelRefinement
+from skyquilt.coregistration.subpixel import Fit, Freedom, SubpixelRefinement
 from skyquilt.coregistration.usable import Usable, both_usable
 from skyquilt.model.estimate import Estimate, NoEstimate
 from skyquilt.model.registration import Guess, Matrix, Picture, RefusedRegistration, Registration
@@ -28,6 +28,8 @@ class Proposal:
     """Number of matches."""
     reason: str = ""
     """Why there is no transform."""
+    stretched: Callable[[], Matrix | None] = lambda: None
+    """Looks for an affine transform (3, 3) in px of the images; None if there is none."""
 
 
 class Proposes(Protocol):
@@ -44,6 +46,8 @@ class StructureMatches:
 
     estimate: Estimator
     """Estimator of a similarity from matches (n, 2)."""
+    stretch: Estimator | None = None
+    """The same of an affine transform; None: none is looked for."""
     count: int = 1500
     """Largest number of keypoints per image."""
     patch: int = 72
@@ -58,11 +62,21 @@ class StructureMatches:
         side = min(self.side, *(float(np.sqrt(p.grey.size)) for p in (a, b)))
         (fa, full_a), (fb, full_b) = self._features(a, side), self._features(b, side)
         in_a, in_b = mutual(fa, fb)
-        found = self.estimate(fa.px[in_a], fb.px[in_b])
-        if isinstance(found, NoEstimate):
-            return Proposal(b_H_a=None, matches=len(in_a), reason=found.reason)
-        full = np.linalg.inv(full_b) @ found.b_H_a @ full_a
-        return Proposal(b_H_a=full / full[2, 2], matches=len(in_a))
+        px = fa.px[in_a], fb.px[in_b]
+
+        def full(estimate: Estimate | NoEstimate) -> Matrix | None:
+            if isinstance(estimate, NoEstimate):
+                return None
+            moved = np.linalg.inv(full_b) @ estimate.b_H_a @ full_a
+            return np.asarray(moved / moved[2, 2])
+
+        found = self.estimate(*px)
+        return Proposal(
+            b_H_a=full(found),
+            matches=len(in_a),
+            reason=found.reason if isinstance(found, NoEstimate) else "",
+            stretched=lambda: full(self.stretch(*px)) if self.stretch else None,
+        )
 
     def _features(self, picture: Usable, side: float) -> tuple[IndexFeatures, Matrix]:
         """Features, and the transform from full-size pixels to theirs."""
@@ -104,11 +118,10 @@ class Structure:
         return self.decide(pyramid, [sharpened(pyramid, proposal.b_H_a, pyramid.last - 1)])
 
 
-def sharpened(pyramid: Pyramid, b_H_a: Matrix, level: int) -> Fit:
+def sharpened(pyramid: Pyramid, b_H_a: Matrix, level: int, freedom: Freedom = "similarity") -> Fit:
     """Refines a transform of the images' pixels at a level, then at the last level; the result is
     in px of the last level.
     """
-    rough = SubpixelRefinement()(*pyramid.at(level), pyramid.small(b_H_a, level))
-    return SubpixelRefinement()(
-        *pyramid.at(pyramid.last), pyramid.moved(rough.b_H_a, level, pyramid.last)
-    )
+    refine = SubpixelRefinement(freedom=freedom)
+    rough = refine(*pyramid.at(level), pyramid.small(b_H_a, level))
+    return refine(*pyramid.at(pyramid.last), pyramid.moved(rough.b_H_a, level, pyramid.last))

@@ -37,6 +37,8 @@ class Fit:
     """Coefficient over the overlap, in [-1, 1]."""
     overlap: float
     """Overlap in px of b."""
+    freedom: Freedom = "similarity"
+    """Type of the transform."""
 
     @property
     def score(self) -> float:
@@ -57,14 +59,14 @@ class SubpixelRefinement:
     def __call__(self, a: Orientation, b: Orientation, b_H_a: Matrix) -> Fit:
         """The best transform near a given one; the given one itself if none is better."""
         frame = _Frame.of(b.shape)
-        best, fields, valid = _tried(a, b, b_H_a)
+        best, fields, valid = self._tried(a, b, b_H_a)
         for _ in range(self.steps):
             change = _change(fields, valid, b, frame, self.freedom)
             if change is None:
                 break
             for share in (1.0, 0.5, 0.25):
                 step = frame.applied(change * share, self.freedom)
-                fit, moved, covered = _tried(a, b, step @ best.b_H_a)
+                fit, moved, covered = self._tried(a, b, step @ best.b_H_a)
                 if fit.correlation > best.correlation + 1e-5:
                     best, fields, valid = fit, moved, covered
                     break
@@ -74,22 +76,23 @@ class SubpixelRefinement:
                 break
         return best
 
-
-def _tried(
-    a: Orientation, b: Orientation, b_H_a: Matrix
-) -> tuple[Fit, Fields, NDArray[np.float32]]:
-    b_H_a = b_H_a / b_H_a[2, 2]
-    fields, valid = warped(a, b_H_a, b.shape)
-    both = valid * b.valid
-    product = float(np.vdot(fields, b.fields))
-    energy_a = float(np.vdot(strength(fields), b.valid))
-    energy_b = float(np.vdot(b.strength, valid))
-    correlation = product / np.sqrt(energy_a * energy_b + _TINY)
-    return (
-        Fit(b_H_a=b_H_a, correlation=float(correlation), overlap=float(both.sum())),
-        fields,
-        valid,
-    )
+    def _tried(
+        self, a: Orientation, b: Orientation, b_H_a: Matrix
+    ) -> tuple[Fit, Fields, NDArray[np.float32]]:
+        b_H_a = b_H_a / b_H_a[2, 2]
+        fields, valid = warped(a, b_H_a, b.shape)
+        both = valid * b.valid
+        product = float(np.vdot(fields, b.fields))
+        energy_a = float(np.vdot(strength(fields), b.valid))
+        energy_b = float(np.vdot(b.strength, valid))
+        correlation = product / np.sqrt(energy_a * energy_b + _TINY)
+        fit = Fit(
+            b_H_a=b_H_a,
+            correlation=float(correlation),
+            overlap=float(both.sum()),
+            freedom=self.freedom,
+        )
+        return fit, fields, valid
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

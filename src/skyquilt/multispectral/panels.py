@@ -109,11 +109,11 @@ def _note(seen: Sequence[Sequence[_Seen]], factors: Sequence[float]) -> Note:
         told += f" and the sun sensor, whose readings are multiplied by {low:.2f} to {high:.2f}"
     ordered = [sorted(own, key=lambda s: s.over_sensor) for own in seen]
     dark, bright = max(((o[0], o[-1]) for o in ordered), key=lambda e: _times(*e))
-    if _times(dark, bright) > _DIFFERS:
+    if (times := _times(dark, bright)) > _DIFFERS:
         return Note(
-            text=f"{told}. By {bright.name} there was {_times(dark, bright):.1f} times as much light"
-            f" as by {dark.name}: there was a cloud, or a shadow on the panel or the sensor. Take"
-            " away pictures of a panel in a shadow.",
+            text=f"{told}. By {bright.name} there was {times:.1f} times as much light as by"
+            f" {dark.name}: there was a cloud, or a shadow on the panel or the sensor. Take away"
+            " pictures of a panel in a shadow.",
             warning=True,
         )
     if low > 1 / _DIFFERS and high < _DIFFERS:
