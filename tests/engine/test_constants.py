@@ -77,7 +77,7 @@ IN_NO_KEY = {
     ),
     **dict.fromkeys(
         ("NOISE", "TEXTURE", "RIM", "_DERIVE", "_SMOOTH", "RADIUS", "MIN_PEAK", "BROAD_PEAK")
-        + ("APART", "MAX_RATIO", "SIDE", "COARSE"),
+        + ("APART", "MAX_RATIO", "SIDE", "COARSE", "_PLAIN", "_LAPLACIANS"),
         "seams are measured anew by every run",
     ),
     **dict.fromkeys(

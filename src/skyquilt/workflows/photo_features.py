@@ -397,10 +397,6 @@ def find_features(
     )
 
 
-_UNITS = ("", "counts", "celsius")
-"""Units of pixels, those that tell most last."""
-
-
 def _kind(kind: tuple[int, str, str, str]) -> str:
     """In words: bands, type, spectrum and unit of pixels."""
     channels, dtype, band, unit = kind
@@ -409,11 +405,10 @@ def _kind(kind: tuple[int, str, str, str]) -> str:
 
 def of_one_kind(found: FeaturedPhotos) -> FeaturedPhotos:
     """The photos with the most frequent kind of pixels, since all photos of a map must have the
-    same kind; of kinds as frequent the one in degrees, else in counts (files that were converted,
-    beside those that they were converted from).
+    same kind; of kinds as frequent the one in degrees (of files that were converted to it).
     """
     kinds = [(p.channels, p.dtype, p.band, p.unit) for p in found.photos]
-    common = max(set(kinds), key=lambda k: (kinds.count(k), _UNITS.index(k[3]), k))
+    common = max(set(kinds), key=lambda k: (kinds.count(k), k[3] == "celsius", k))
     keep = [i for i, k in enumerate(kinds) if k == common]
     odd = tuple(
         RejectedPhoto(
