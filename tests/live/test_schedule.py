@@ -34,7 +34,7 @@ def blocks_of(*sizes, closed=(), since=1, loop=None, waiting=0):
     schedule = Schedule(closed_at=dict(zip(sets, closed, strict=False)), since=since, loop=loop)
     parts = methods_for(MosaicSettings())
     blocks = Blocks(members, schedule, LiveSettings(), Path(), Path(), parts)
-    blocks._job = lambda ids, held, ground, sweep: (ids, held)
+    blocks._job = lambda ids, held, ground, quiet: (ids, held)
     return blocks
 
 
@@ -52,30 +52,30 @@ def test_every_block_is_bundled_as_it_grows_not_only_the_largest():
     assert 7 / 6 < GROWTH
 
 
-def test_when_no_photos_arrive_all_blocks_are_adjusted_as_they_are_and_swept_once():
+def test_when_no_photos_arrive_all_blocks_are_adjusted_thoroughly_once():
     blocks = blocks_of(13, 12, SWEEPING + 1, 2, closed=(10, 12, SWEEPING + 1))
     asked = []
-    blocks._job = lambda ids, held, ground, sweep: asked.append((min(ids), sweep)) or (ids, held)
+    blocks._job = lambda ids, held, ground, quiet: asked.append((min(ids), quiet)) or (ids, held)
     assert blocks.due(0.0, idle=False)[0] == list(range(1, 14))  # it has grown
     assert blocks.due(0.0, idle=True) is None  # photos have just arrived
     blocks.last_arrival -= QUIET_S + 1
     while blocks.due(0.0, idle=True) is not None:
         pass
-    assert asked == [(1, False), (1, True), (14, True)]
-    blocks.schedule.swept_at.clear()
+    assert asked == [(1, False), (1, True), (14, True), (26, True)]
+    blocks.schedule.thorough_at.clear()
     blocks.schedule.given_up({k: len(v) for k, v in blocks.members.blocks.items()})
     assert blocks.due(0.0, idle=True) is None
 
 
-def test_what_was_swept_is_known_after_a_restart_but_not_what_was_under_way():
+def test_what_was_thorough_is_known_after_a_restart_but_not_what_was_under_way():
     kept = {}
     ledger = SimpleNamespace(meta=kept.get, put_meta=kept.__setitem__)
     schedule = Schedule.read(ledger)
-    schedule.begun(1, 13, sweep=True)
+    schedule.begun(1, 13, thorough=True)
     schedule.ended()
-    schedule.begun(14, 12, sweep=True)
+    schedule.begun(14, 12, thorough=True)
     schedule.write(ledger)
-    assert Schedule.read(ledger).swept_at == {1: 13}
+    assert Schedule.read(ledger).thorough_at == {1: 13}
 
 
 def test_blocks_of_which_no_photo_is_on_the_map_are_not_adjusted():
@@ -163,7 +163,7 @@ def test_what_was_adjusted_anew_in_the_meantime_is_not_put_back(since, cell, blo
     )
     stored = []
     schedule = Schedule(since=4)
-    schedule.begun(1, 3, sweep=False)
+    schedule.begun(1, 3, thorough=False)
     refinement = SimpleNamespace(
         members=SimpleNamespace(
             by_id=by_id, block=lambda i: set(range(1, block + 1)), save_cameras=lambda cameras: None

@@ -31,8 +31,8 @@ class Schedule:
 
     closed_at: dict[int, int] = field(default_factory=dict)
     """Number of photos that each block had when it was last adjusted as a whole, by block name."""
-    swept_at: dict[int, int] = field(default_factory=dict)
-    """The same of the last time when ground heights were computed as in `mosaic` as well."""
+    thorough_at: dict[int, int] = field(default_factory=dict)
+    """The same of the last time when no photos arrived, so that it was adjusted thoroughly."""
     since: int = 0
     """Number of photos refined since a block was last adjusted."""
     loop: int | None = None
@@ -50,13 +50,13 @@ class Schedule:
     def read(cls, ledger: Ledger) -> "Schedule":
         """Reads the state that was last stored."""
         found = ledger.meta(KEY) or {}
-        closed, swept = (
+        closed, thorough = (
             {int(k): int(v) for k, v in found.get(key, {}).items()}
-            for key in ("closed_at", "swept_at")
+            for key in ("closed_at", "thorough_at")
         )
         return cls(
             closed_at=closed,
-            swept_at=swept,
+            thorough_at=thorough,
             since=int(found.get("since", 0)),
             loop=found.get("loop"),
             checked=bool(found.get("checked", True)),
@@ -69,7 +69,8 @@ class Schedule:
         if began is not None:
             record["since"] += began["since"]
             record["loop"] = record["loop"] if record["loop"] is not None else began["loop"]
-            record["closed_at"], record["swept_at"] = began["closed_at"], began["swept_at"]
+            for key in ("closed_at", "thorough_at"):
+                record[key] = began[key]
         ledger.put_meta(KEY, record)
 
     def refined(self, photo: int, *, loop: bool) -> None:
@@ -78,21 +79,21 @@ class Schedule:
         if loop:
             self.loop = photo
 
-    def begun(self, block: int, size: int, *, sweep: bool, part: bool = False) -> None:
+    def begun(self, block: int, size: int, *, thorough: bool, part: bool = False) -> None:
         """Notes that a job begins on a block of `size` photos; `part`: on a part of it, and it will
         be adjusted as a whole later.
         """
-        before = {"closed_at": dict(self.closed_at), "swept_at": dict(self.swept_at)}
+        before = {"closed_at": dict(self.closed_at), "thorough_at": dict(self.thorough_at)}
         self.under_way = {"since": self.since, "loop": self.loop, **before}
         self.since, self.loop = 0, None
         if not part:
             self.closed_at[block] = size
-        if sweep:
-            self.swept_at[block] = size
+        if thorough:
+            self.thorough_at[block] = size
 
     def given_up(self, sizes: Mapping[int, int]) -> None:
         """Notes that nothing is due on blocks of these sizes until the next photo."""
-        self.closed_at, self.swept_at = dict(sizes), dict(sizes)
+        self.closed_at, self.thorough_at = dict(sizes), dict(sizes)
         self.since, self.loop = 0, None
 
     def ended(self) -> None:
@@ -154,11 +155,10 @@ class Blocks:
             if not idle and self.schedule.loop is None and self.schedule.since < PART // 4:
                 return None
             ids, held = self._around(root)
-        sweep = quiet and not held and len(ids) <= SWEEPING
-        job = self._job(ids, held, ground, sweep=sweep)
+        job = self._job(ids, held, ground, quiet=quiet)
         if job is not None:
             part = large and len(block) <= WHOLE
-            self.schedule.begun(name, len(block), sweep=sweep, part=part)
+            self.schedule.begun(name, len(block), thorough=quiet and not held, part=part)
         return job
 
     def _root(self) -> int:
@@ -187,16 +187,14 @@ class Blocks:
         ]
 
     def _unfinished(self, paused: bool) -> int:
-        """The newest photo of a block that was not adjusted as it is now, or not with ground
-        heights as in `mosaic`; 0 where there is none. Large blocks only count where photos pause;
-        those beyond are adjusted in parts as they grow.
+        """The newest photo of a block that was not adjusted thoroughly as it is now; 0 where there
+        is none. Large blocks only count where photos pause; those beyond are adjusted in parts as
+        they grow.
         """
         most = WHOLE if paused else CLOSING
-        closed, swept = self.schedule.closed_at, self.schedule.swept_at
         for name, block in self._on_map():
             size = len(block)
-            last = swept if size <= SWEEPING else closed
-            if 3 <= size <= most and last.get(name) != size:
+            if 3 <= size <= most and self.schedule.thorough_at.get(name) != size:
                 return max(block)
         return 0
 
@@ -215,7 +213,7 @@ class Blocks:
         return sorted(ids), frozenset(ids[PART:])
 
     def _job(
-        self, ids: list[int], held: frozenset[int], ground: float, *, sweep: bool
+        self, ids: list[int], held: frozenset[int], ground: float, *, quiet: bool
     ) -> AdjustmentJob | None:
         members = [self.members.by_id[i] for i in ids]
         frame = self.members.frame
@@ -237,6 +235,7 @@ class Blocks:
             folder=self.folder,
             store=self.store,
             methods=self.methods,
-            sweep=sweep,
+            thorough=quiet or self.settings.deterministic,
+            sweep=quiet and not held and len(ids) <= SWEEPING,
             most_view_deg=self.settings.max_view_angle,
         )

@@ -39,6 +39,9 @@ from skyquilt.workflows.photo_features import (
     picture_recipe,
 )
 
+QUICK = Bundle(per_photo=150, match_observations=None, thorough=False)
+"""Adjusts blocks that are soon adjusted again."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class AdjustmentJob:
@@ -70,6 +73,10 @@ class AdjustmentJob:
     """The store's folder."""
     methods: Methods
     """The methods with which features were found."""
+    thorough: bool
+    """Whether it is adjusted as in the batch workflow, with what users must know of it; otherwise
+    in a third of the time, as photos arrive, and it is soon adjusted again.
+    """
     sweep: bool
     """Whether ground heights are also computed from the images, as in the batch workflow."""
     most_view_deg: float = 90.0
@@ -93,7 +100,7 @@ class BlockAdjustment:
     rejected: dict[int, str] = field(default_factory=dict)
     """Photos that could not be held, with reasons."""
     notes: tuple[str, ...] = ()
-    """What users of a map of these photos must know; empty if only part of a block was adjusted."""
+    """What users of a map of these photos must know; empty if it was not adjusted thoroughly."""
     before: dict[int, Pose] = field(default_factory=dict)
     """Poses when the job began."""
     problem: str = ""
@@ -147,7 +154,8 @@ def _whole(
     job: AdjustmentJob, links: Sequence[Link], features: Sequence[Features], store: Store
 ) -> BlockAdjustment:
     pictures = GreyPictures(job.photos, lambda i: read_color(job.photos[i]), store)
-    done = Bundle()(job.photos, job.frame, job.priors, features, links, (), pictures)
+    bundle = Bundle() if job.thorough else QUICK
+    done = bundle(job.photos, job.frame, job.priors, features, links, (), pictures)
     if job.frame.crs is None:
         before = {k: job.poses[i] for k, i in enumerate(job.ids) if i in job.poses}
         held = in_frame_of(done, before, job.ground)
@@ -162,7 +170,9 @@ def _whole(
         camera_of={job.ids[k]: done.camera_of[k] for k in done.poses},
         xyz=xyz,
         rejected={job.ids[k]: why for k, why in done.rejected.items()},
-        notes=(*done.notes, *tilt_warnings(job.priors, done, job.most_view_deg)),
+        notes=(*done.notes, *tilt_warnings(job.priors, done, job.most_view_deg))
+        if job.thorough
+        else (),
     )
 
 

@@ -302,6 +302,7 @@ class LiveMap:
             (self._placed() if self._room else None)
             or self._drawn_first()
             or self._applied()
+            or self._grown()
             or self._refined()
             or self._drawn_last()
             or self._behind()
@@ -380,13 +381,23 @@ class LiveMap:
         done = self.background.outcome()
         return None if done is None else self.apply_adjustment.apply(done)
 
+    def _grown(self) -> Update | None:
+        """Starts the adjustment of a block that has grown. Where photos come faster than they are
+        refined and drawn, there is never nothing else to do, and lines would bend ever further.
+        """
+        return None if self.background.busy else self._adjusted(idle=False)
+
     def _behind(self) -> Update | None:
-        """Starts the adjustment of a block in a separate process."""
+        """Looks for what else can be adjusted or linked, where nothing else is to do."""
         if self.background.busy:
             return None
         if self.blocks.quiet and (update := self.refinement.rejoined()) is not None:
             return update
-        job = self.blocks.due(self.canvas.ground, idle=True)
+        return self._adjusted(idle=True)
+
+    def _adjusted(self, *, idle: bool) -> Update | None:
+        """Starts the adjustment of a block in a separate process, if one is due."""
+        job = self.blocks.due(self.canvas.ground, idle=idle)
         if job is None:
             return None
         self.background.start(job)

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.aligners import ONE_TONE
-from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.determined import AGAINST, elsewhere_reason, lies_elsewhere
 from skyquilt.alignment.local_adjustment import AdjustedWindow, LocalAdjustment, Window
 from skyquilt.alignment.oblique import axes_apart_deg
 from skyquilt.errors import AlignmentError, UnreadablePhotoError
+from skyquilt.live.background_adjustment import QUICK
 from skyquilt.live.drone_metadata import Metadata
 from skyquilt.live.kept_frame import in_frame_of
 from skyquilt.live.links import LiveLinks
@@ -83,7 +83,6 @@ class LocalPose:
         self.members, self.settings = members, settings
         self.metadata, self.neighbours, self.live_links = metadata, neighbours, live_links
         self.adjust_locally = LocalAdjustment()
-        self.young = Bundle(per_photo=150, match_observations=None, thorough=False)
 
     def refine(
         self, member: Member, more: Mapping[tuple[int, int], Link | None] = MappingProxyType({})
@@ -225,7 +224,7 @@ class LocalPose:
         members = [self.members.by_id[i] for i in ids]
         assert self.members.frame is not None
         try:
-            done = self.young(
+            done = QUICK(
                 [m.photo for m in members],
                 self.members.frame,
                 [m.prior for m in members],
