@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from skyquilt.live import adjustment_schedule
 from skyquilt.live.background_adjustment import adjust_block
 from skyquilt.live.live_map import LiveMap
 from skyquilt.live.settings import LiveSettings
@@ -13,8 +14,9 @@ from tests.live.conftest import made
 
 
 @pytest.fixture
-def live(flight, tmp_path):
+def live(flight, tmp_path, monkeypatch):
     """A map of six photos; jobs are kept, not run."""
+    monkeypatch.setattr(adjustment_schedule, "YOUNG", 2)
     live = LiveMap(tmp_path / "out", LiveSettings(features=200, gsd_cm=60.0))
     jobs = []
     live.background = SimpleNamespace(

@@ -34,7 +34,7 @@ def blocks_of(*sizes, closed=(), since=1, loop=None, waiting=0):
     schedule = Schedule(closed_at=dict(zip(sets, closed, strict=False)), since=since, loop=loop)
     parts = methods_for(MosaicSettings())
     blocks = Blocks(members, schedule, LiveSettings(), Path(), Path(), parts)
-    blocks._job = lambda ids, held, ground, quiet: (ids, held)
+    blocks._job = lambda ids, held, ground, **how: (ids, held)
     return blocks
 
 
@@ -55,13 +55,15 @@ def test_every_block_is_bundled_as_it_grows_not_only_the_largest():
 def test_when_no_photos_arrive_all_blocks_are_adjusted_thoroughly_once():
     blocks = blocks_of(13, 12, SWEEPING + 1, 2, closed=(10, 12, SWEEPING + 1))
     asked = []
-    blocks._job = lambda ids, held, ground, quiet: asked.append((min(ids), quiet)) or (ids, held)
+    blocks._job = lambda ids, held, ground, thorough, sweep: (
+        asked.append((min(ids), thorough, sweep)) or (ids, held)
+    )
     assert blocks.due(0.0, idle=False)[0] == list(range(1, 14))  # it has grown
     assert blocks.due(0.0, idle=True) is None  # photos have just arrived
     blocks.last_arrival -= QUIET_S + 1
     while blocks.due(0.0, idle=True) is not None:
         pass
-    assert asked == [(1, False), (1, True), (14, True), (26, True)]
+    assert asked == [(1, False, False), (1, True, True), (14, True, True), (26, True, False)]
     blocks.schedule.thorough_at.clear()
     blocks.schedule.given_up({k: len(v) for k, v in blocks.members.blocks.items()})
     assert blocks.due(0.0, idle=True) is None
@@ -78,11 +80,21 @@ def test_what_was_thorough_is_known_after_a_restart_but_not_what_was_under_way()
     assert Schedule.read(ledger).thorough_at == {1: 13}
 
 
-def test_blocks_of_which_no_photo_is_on_the_map_are_not_adjusted():
-    blocks = blocks_of(4, 9, closed=(3,), waiting=1)
-    assert blocks.due(0.0, idle=False)[0] == list(range(1, 5))
+def test_small_blocks_are_adjusted_with_every_photo_and_wait_for_quiet():
+    blocks = blocks_of(YOUNG, closed=(3,))
+    assert blocks.due(0.0, idle=False) is None
     blocks.last_arrival -= QUIET_S + 1
-    assert blocks.due(0.0, idle=True)[0] == list(range(1, 5))
+    assert blocks.due(0.0, idle=False) is None
+    assert blocks.due(0.0, idle=True)[0] == list(range(1, YOUNG + 1))
+    larger = blocks_of(YOUNG, YOUNG + 1, closed=(3, 5))  # the smaller one has grown more
+    assert larger.due(0.0, idle=False)[0] == list(range(YOUNG + 1, 2 * YOUNG + 2))
+
+
+def test_blocks_of_which_no_photo_is_on_the_map_are_not_adjusted():
+    blocks = blocks_of(14, 19, closed=(3,), waiting=1)
+    assert blocks.due(0.0, idle=False)[0] == list(range(1, 15))
+    blocks.last_arrival -= QUIET_S + 1
+    assert blocks.due(0.0, idle=True)[0] == list(range(1, 15))
     assert blocks.due(0.0, idle=True) is None
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from skyquilt.live.background_adjustment import AdjustmentJob
 from skyquilt.live.ledger import Ledger
 from skyquilt.live.members import Members
-from skyquilt.live.settings import CLOSING, GROWTH, PART, SWEEPING, WHOLE, LiveSettings
+from skyquilt.live.settings import CLOSING, GROWTH, PART, SWEEPING, WHOLE, YOUNG, LiveSettings
 from skyquilt.model.camera import Camera
 from skyquilt.workflows.methods import Methods
 
@@ -143,11 +143,14 @@ class Blocks:
         quiet, paused = idle and self.quiet, idle and self.paused
         if not self.settings.reposition or not (quiet or self.schedule.since):
             return None
-        root = self._root() if self.schedule.since else self._unfinished(paused)
+        thorough = quiet or self.settings.deterministic
+        # smaller ones were adjusted so with the newest of their photos
+        least = 3 if thorough else YOUNG + 1
+        root = self._root(least) if self.schedule.since else self._unfinished(paused)
         block = self.members.block(root) if root in self.members.by_id else set[int]()
         name = self.members.block_of.get(root, root)
         grown = len(block) >= GROWTH * self.schedule.closed_at.get(name, 2)
-        if len(block) < 3 or not (grown or self.schedule.loop is not None or quiet):
+        if len(block) < least or not (grown or self.schedule.loop is not None or quiet):
             return None
         ids, held = sorted(block), frozenset[int]()
         large = len(block) > WHOLE or (len(block) > CLOSING and not (grown or paused))
@@ -155,21 +158,22 @@ class Blocks:
             if not idle and self.schedule.loop is None and self.schedule.since < PART // 4:
                 return None
             ids, held = self._around(root)
-        job = self._job(ids, held, ground, quiet=quiet)
+        sweep = quiet and not held and len(ids) <= SWEEPING
+        job = self._job(ids, held, ground, thorough=thorough, sweep=sweep)
         if job is not None:
             part = large and len(block) <= WHOLE
             self.schedule.begun(name, len(block), thorough=quiet and not held, part=part)
         return job
 
-    def _root(self) -> int:
+    def _root(self, least: int) -> int:
         """A photo of the block to adjust: the one that closed a loop, otherwise the newest photo of
-        the block that has grown most.
+        the block that has grown most, of those with at least so many photos; 0 where there is none.
         """
         if self.schedule.loop is not None:
             return self.schedule.loop
         closed = self.schedule.closed_at
         grown = max(
-            self._on_map(),
+            (b for b in self._on_map() if len(b[1]) >= least),
             key=lambda b: (len(b[1]) / closed.get(b[0], 2), len(b[1]), -b[0]),
             default=(0, {0}),
         )
@@ -213,7 +217,7 @@ class Blocks:
         return sorted(ids), frozenset(ids[PART:])
 
     def _job(
-        self, ids: list[int], held: frozenset[int], ground: float, *, quiet: bool
+        self, ids: list[int], held: frozenset[int], ground: float, *, thorough: bool, sweep: bool
     ) -> AdjustmentJob | None:
         members = [self.members.by_id[i] for i in ids]
         frame = self.members.frame
@@ -235,7 +239,7 @@ class Blocks:
             folder=self.folder,
             store=self.store,
             methods=self.methods,
-            thorough=quiet or self.settings.deterministic,
-            sweep=quiet and not held and len(ids) <= SWEEPING,
+            thorough=thorough,
+            sweep=sweep,
             most_view_deg=self.settings.max_view_angle,
         )
