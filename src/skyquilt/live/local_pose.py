@@ -82,7 +82,7 @@ class LocalPose:
     ) -> None:
         self.members, self.settings = members, settings
         self.metadata, self.neighbours, self.live_links = metadata, neighbours, live_links
-        self.adjust_locally = LocalAdjustment()
+        self.adjust_locally, self.young = LocalAdjustment(), QUICK
 
     def refine(
         self, member: Member, more: Mapping[tuple[int, int], Link | None] = MappingProxyType({})
@@ -224,7 +224,7 @@ class LocalPose:
         members = [self.members.by_id[i] for i in ids]
         assert self.members.frame is not None
         try:
-            done = QUICK(
+            done = self.young(
                 [m.photo for m in members],
                 self.members.frame,
                 [m.prior for m in members],
