@@ -47,6 +47,7 @@ from skyquilt.alignment.unfit_cameras import (
     unfit_cameras,
     whole_focals,
 )
+from skyquilt.alignment.unlike_lenses import as_of_lenses
 from skyquilt.alignment.upside_down import turned_note, upside_down
 from skyquilt.engine.free_memory import give_back
 from skyquilt.engine.kept import MADE_NOW, Keep
@@ -89,7 +90,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 85
+    version: ClassVar[int] = 86
 
     def __call__(
         self,
@@ -114,6 +115,7 @@ class Bundle:
 
         def taken(begun: Beginning) -> Sequence[Photo]:
             own = with_focals(photos, begun.focals) if begun.focals else photos
+            own = as_of_lenses(own, begun.lenses) if begun.lenses else own
             return as_enlarged(own, begun.enlarged) if begun.enlarged else own
 
         def adjust(begun: Beginning) -> Alignment:

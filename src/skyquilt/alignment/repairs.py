@@ -42,12 +42,17 @@ from skyquilt.alignment.unfit_cameras import (
     focal_notes,
     unfit_notes,
 )
+from skyquilt.alignment.unlike_lenses import fits_lenses, lenses_note, unlike_lenses
 from skyquilt.errors import AlignmentError
 from skyquilt.model.poses import Alignment, Prior
 
 ENLARGED_AGAIN = 3
 """Photos that are enlarged by other factors are divided so often at most: what fits none of the
 cameras bends the heights by which the next are told.
+"""
+LENSES_AGAIN = 3
+"""Photos are divided among two lenses so often at most: what is left then tells those that were
+given the wrong one.
 """
 AWAY = 0.85
 """Photos that tell their poses, and lie further from their positions than this times their
@@ -194,6 +199,25 @@ def _enlargements(last: Tried, survey: Survey) -> Tried:
     if best is last:
         return last
     return replace(best, notes=(*last.notes, enlarged_note(best.begun.enlarged, survey.cameras)))
+
+
+def _unlike_lenses(last: Tried, survey: Survey) -> Tried:
+    """Photos of two lenses that files tell to be of one camera are calibrated by themselves."""
+    best = last
+    for again in range(LENSES_AGAIN):
+        before = best.begun.lenses
+        lenses = unlike_lenses(best.found, survey.cameras, before)
+        if not lenses or lenses == before:
+            break
+        other = survey.tried(best.begun, lenses=lenses, name=f"lenses {again} ")
+        fits = fits_cut if before else fits_lenses
+        if not fits(other.found, best.found):
+            break
+        best = other
+    if best is last:
+        return last
+    note = lenses_note(best.begun.lenses, survey.cameras, survey.names)
+    return replace(best, notes=(*last.notes, note))
 
 
 def _cut_pictures(last: Tried, survey: Survey) -> Tried:
@@ -379,6 +403,7 @@ REPAIRS: tuple[Callable[[Tried, Survey], Tried], ...] = (
     _mirrored_positions,
     _as_reported,
     _enlargements,
+    _unlike_lenses,
     _cut_pictures,
     _late_positions,
     _leaning_lines,
