@@ -107,13 +107,15 @@ def misfit_px(found: Alignment) -> float:
     return float(np.linalg.norm(found.ties.residual_px, axis=1).mean())
 
 
-def fits_better(other: Alignment, found: Alignment, *, kept: float = 1.0) -> bool:
-    """Whether an alignment fits the pictures clearly better than another, with no fewer photos and
-    at least this share of the observations.
+def fits_better(
+    other: Alignment, found: Alignment, *, kept: float = 1.0, share: float = BETTER
+) -> bool:
+    """Whether an alignment fits the pictures clearly better than another, by a mean residual below
+    this share, with no fewer photos and at least the share `kept` of the observations.
     """
     whole = len(other.held) >= len(found.held)
     whole &= len(other.ties.photo) >= kept * len(found.ties.photo)
-    return whole and misfit_px(other) < BETTER * misfit_px(found)
+    return whole and misfit_px(other) < share * misfit_px(found)
 
 
 def enlarged_note(factors: Mapping[int, float], cameras: Sequence[str]) -> str:

@@ -210,8 +210,7 @@ def _unlike_lenses(last: Tried, survey: Survey) -> Tried:
         if not lenses or lenses == before:
             break
         other = survey.tried(best.begun, lenses=lenses, name=f"lenses {again} ")
-        fits = fits_cut if before else fits_lenses
-        if not fits(other.found, best.found):
+        if not fits_lenses(other.found, best.found, before):
             break
         best = other
     if best is last:

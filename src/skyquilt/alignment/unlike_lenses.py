@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.enlarged import FEWEST, misfit_px
+from skyquilt.alignment.enlarged import FEWEST, fits_better, misfit_px
 from skyquilt.model.camera import Camera
 from skyquilt.model.photo import Photo, evenly
 from skyquilt.model.poses import Alignment
@@ -33,6 +33,8 @@ LEAST = 2.5
 """Distance of the groups at least, as a shift in a corner of the picture, over the mean residual:
 where photos err by chance it is seldom more than 2.
 """
+KEPT = 0.99
+"""Share of the observations that an adjustment with two lenses keeps at least."""
 BETTER = 0.92
 """Two lenses are taken where the mean residual falls below this share: an error of a lens model
 that all photos share lets it fall by less.
@@ -71,13 +73,13 @@ def as_of_lenses(photos: Sequence[Photo], lenses: Mapping[int, int]) -> list[Pho
     return out
 
 
-def fits_lenses(other: Alignment, found: Alignment) -> bool:
-    """Whether an alignment with two lenses fits the pictures much better than one with one, with no
-    fewer photos and hardly fewer observations.
+def fits_lenses(other: Alignment, found: Alignment, before: Mapping[int, int]) -> bool:
+    """Whether an alignment with two lenses fits the pictures much better than one with one, or
+    clearly better than one with two that some photos were given otherwise (`before`).
     """
-    whole = len(other.held) >= len(found.held)
-    whole &= len(other.ties.photo) >= 0.99 * len(found.ties.photo)
-    return whole and misfit_px(other) < BETTER * misfit_px(found)
+    if before:
+        return fits_better(other, found, kept=KEPT)
+    return fits_better(other, found, kept=KEPT, share=BETTER)
 
 
 def lenses_note(lenses: Mapping[int, int], cameras: Sequence[str], names: Sequence[str]) -> str:
