@@ -179,20 +179,23 @@ def whole_focals(
     out = dict[str, float]()
     for key in sorted(cameras):
         camera = found.cameras[key]
-        size = np.array([camera.width, camera.height], float)
-        beside = np.abs(np.array([camera.cx, camera.cy]) - (size - 1) / 2)
-        longer = float((size + 2 * beside).max() / size.max())
+        (right, down), (w, h) = _off_the_middle(camera), (camera.width, camera.height)
+        longer = max(w + 2 * abs(right), h + 2 * abs(down)) / max(w, h)
         if longer > 1 + CUT_BESIDE:
             out[key] = longer * begun.get(key, 1.0)
     return out
+
+
+def _off_the_middle(camera: Camera) -> tuple[float, float]:
+    """How far right of and below the middle of the picture its principal point lies, px."""
+    return camera.cx - (camera.width - 1) / 2, camera.cy - (camera.height - 1) / 2
 
 
 def cut_notes(found: Alignment, cameras: Collection[str]) -> tuple[str, ...]:
     """What the user is told of each camera."""
     notes = []
     for key in sorted(cameras):
-        camera = found.cameras[key]
-        right, down = camera.cx - (camera.width - 1) / 2, camera.cy - (camera.height - 1) / 2
+        right, down = _off_the_middle(found.cameras[key])
         notes.append(
             f"The optical axis of {key} meets its photos {abs(right):.0f} px"
             f" {'right' if right > 0 else 'left'} of their middle and {abs(down):.0f} px"

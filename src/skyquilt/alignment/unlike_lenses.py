@@ -167,9 +167,7 @@ def _middle(values: Floats, votes: NDArray[np.int64]) -> tuple[float, float]:
 
 
 def _median(values: Floats, votes: NDArray[np.int64]) -> float:
-    order = np.argsort(values)
-    reached = np.cumsum(votes[order])
-    return float(values[order[np.searchsorted(reached, reached[-1] / 2)]])
+    return float(np.quantile(values, 0.5, weights=votes, method="inverted_cdf"))
 
 
 def _exchanged(

@@ -6,6 +6,7 @@ calibrations of cameras refer to it.
 """
 
 import csv
+import math
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
@@ -67,10 +68,11 @@ class Native:
     def focal_of_file(self, focal: Focal) -> Focal:
         """A focal length in px as captured, in px of the file."""
         px = focal.px * self.scale
-        sigma = focal.sigma_px * self.scale
-        if self.sigma_scale:
-            sigma = (sigma**2 + (self.sigma_scale * px) ** 2) ** 0.5
-        return replace(focal, px=px, sigma_px=sigma)
+        return replace(focal, px=px, sigma_px=self._sigma_of_file(px, focal.sigma_px))
+
+    def _sigma_of_file(self, px: float, sigma: float) -> float:
+        """Deviation of a focal length of `px` in the file, which has this one as captured."""
+        return math.hypot(sigma * self.scale, self.sigma_scale * px)
 
     def camera_of_file(self, camera: Camera) -> Camera:
         """The lens of the picture as captured as that of the file. Nothing tells which part of the
@@ -79,20 +81,18 @@ class Native:
         width, height = self.file
         if not self.part:
             return camera.rescaled(width, height)
-        focal = self.focal_of_file(
-            Focal(
-                px=camera.focal,
-                sigma_px=camera.sigmas[0] if camera.sigmas else 0.0,
-                source="calibrated",
-            )
+        focal, centre = camera.focal * self.scale, _CENTRE * max(width, height)
+        sigmas = camera.sigmas and (
+            self._sigma_of_file(focal, camera.sigmas[0]),
+            centre,
+            centre,
+            *camera.sigmas[3:],
         )
-        centre = _CENTRE * max(width, height)
-        sigmas = camera.sigmas and (focal.sigma_px, centre, centre, *camera.sigmas[3:])
         return replace(
             camera,
             width=width,
             height=height,
-            focal=focal.px,
+            focal=focal,
             cx=(width - 1) / 2,
             cy=(height - 1) / 2,
             sigmas=sigmas,
