@@ -7,6 +7,7 @@ import pytest
 import rasterio
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from PIL import Image
 from rasterio.enums import MaskFlags
 from scipy.ndimage import distance_transform_edt
 
@@ -180,7 +181,25 @@ def test_gdal_s_own_average_agrees(tmp_path):
     assert np.abs(ours.astype(int) - theirs).max() <= 1
 
 
-def test_empty_tiles_take_no_room(tmp_path):
+@pytest.mark.parametrize(
+    "kind", [{"compress": "jpeg", "mask": True}, {"compress": "lzw", "nodata": 9}]
+)
+def test_tiles_without_a_valid_pixel_open_in_programs_that_know_no_missing_ones(tmp_path, kind):
+    """Pillow, like most, reads through libtiff, which refuses tiles of no bytes."""
+    array, valid = picture(1500, 1100), disc(1500, 1100)
+    valid[:520, :520] = False
+    write_array(tmp_path / "a.tif", array, spec_for(array, tile=256, **kind), valid)
+    with Image.open(tmp_path / "a.tif") as file:
+        seen = np.asarray(file)
+    pixels, mask = read(tmp_path / "a.tif")
+    np.testing.assert_array_equal(mask, valid)
+    np.testing.assert_array_equal(pixels[:512, :512], kind.get("nodata", 0))
+    # decoders of JPEG draw colours out in ways of their own
+    assert np.abs(seen.astype(int) - pixels).max() <= (16 if kind["compress"] == "jpeg" else 0)
+    assert_valid_cog(tmp_path / "a.tif")
+
+
+def test_empty_tiles_that_would_double_the_file_take_no_room(tmp_path):
     array = np.full((4096, 4096, 3), 77, np.uint8)
     valid = np.zeros((4096, 4096), bool)
     valid[2100:2200, 2100:2200] = True

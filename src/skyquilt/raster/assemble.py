@@ -35,6 +35,8 @@ IMAGE, MASK = 1, 2
 CODES = {"jpeg": 7, "deflate": 8, "zstd": 50000, "lzw": 5, "none": 1}
 BIG = 3_900_000_000
 """Files that would grow beyond this many bytes become BigTIFF."""
+BLANK = 2**64 - 1
+"""Offset of tiles without a valid pixel, whose bytes the encoder has."""
 
 Index = NDArray[np.uint64]
 
@@ -49,23 +51,38 @@ def assemble(
 ) -> None:
     """Write the file from one index (rows, columns, 3) per level; `read(offset, size)` fetches
     tiles.
+
+    Tiles without a valid pixel are written too, since most programs but GDAL refuse a file that
+    leaves some out. They are left out where they would double the file: a long strip across.
     """
     spec = encoder.spec
+    indices = _with_blanks(encoder, indices)
     total = sum(int(_spans(spec, index).sum()) for index in indices)
     head_size = len(_head(encoder, indices, 0, big=True))
     if big is None:
         big = total + head_size > BIG
     head_size = len(_head(encoder, indices, 0, big=big))
+    blank = b"".join(encoder.blank)
     with whole_file(path, needed=head_size + total) as file:
         file.write(_head(encoder, indices, head_size, big=big))
         for index in reversed(indices):
             for offset, image, mask in index.reshape(-1, 3).tolist():
                 if not image:
                     continue
-                data = read(offset, image + mask)
+                data = blank if offset == BLANK else read(offset, image + mask)
                 file.write(_framed(data[:image]))
                 if spec.mask:
                     file.write(_framed(data[image:]))
+
+
+def _with_blanks(encoder: TileEncoder, indices: Sequence[Index]) -> Sequence[Index]:
+    """The indices with a blank tile for each empty one, unless these outweigh the others."""
+    blank = np.array([BLANK, *(len(part) for part in encoder.blank)], np.uint64)
+    filled = [np.where(index[..., IMAGE, None] > 0, index, blank) for index in indices]
+    before, after = (
+        sum(int(_spans(encoder.spec, index).sum()) for index in each) for each in (indices, filled)
+    )
+    return filled if after <= 2 * before else indices
 
 
 def _framed(data: bytes) -> bytes:

@@ -43,6 +43,13 @@ class TileEncoder:
         return b"\xff\xd8" + split_jpeg(self._jpeg_stream(sample))[0] + b"\xff\xd9"
 
     @cached_property
+    def blank(self) -> tuple[bytes, bytes]:
+        """Image and mask bytes of a tile without a valid pixel."""
+        side = self.spec.tile
+        nothing = np.zeros((side, side, self.spec.bands), self.spec.numpy_dtype)
+        return self(nothing, np.zeros((side, side), bool))
+
+    @cached_property
     def _full_mask(self) -> bytes:
         return pack_mask(np.ones((self.spec.tile, self.spec.tile), bool))
 
