@@ -267,7 +267,7 @@ class OutputSettings:
     """How the map is written."""
 
     compress: str = "auto"
-    """One of `COMPRESSIONS`; auto = JPEG for 8-bit pictures, zstd for measured values."""
+    """One of `COMPRESSIONS`; auto = JPEG for 8-bit pictures, deflate for measured values."""
     quality: int = 85
     """JPEG quality."""
     dtm: bool = False

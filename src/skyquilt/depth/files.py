@@ -67,7 +67,6 @@ def write_depth(
         transform=geotransform(grid, alignment),
         crs=alignment.frame.crs,
         vertical=VERTICAL_EPSG.get(tags["VERTICAL_DATUM"]),
-        compress="zstd",
         nodata=float("nan"),
         tags={"SOFTWARE": "Skyquilt"} | tags,
         band_units=(tags["UNIT"],),

@@ -95,7 +95,6 @@ def _write(
         transform=geotransform(cells, alignment),
         crs=alignment.frame.crs,
         vertical=VERTICAL_EPSG.get(alignment.frame.vertical_datum) if real else None,
-        compress="zstd" if real else "deflate",
         nodata=float("nan") if real else 0.0,
         tags={"SOFTWARE": "Skyquilt"} | tags,
         band_units=("m",) if real and alignment.frame.metric else (),

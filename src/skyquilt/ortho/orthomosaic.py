@@ -89,7 +89,7 @@ def mosaic_spec(
     """How mosaic.tif is written."""
     compress, unfit = cast(Compression, settings.compress), not_jpeg(compose.dtype, compose.bands)
     if settings.compress == "auto":
-        compress = "zstd" if unfit else "jpeg"
+        compress = "deflate" if unfit else "jpeg"
     if compress == "jpeg" and unfit:
         raise UsageError(unfit)
     real = compose.dtype.kind == "f"
@@ -359,7 +359,6 @@ def write_surface(output: Path, ground: Ground, alignment: Alignment) -> None:
         transform=geotransform(coarse, alignment),
         crs=alignment.frame.crs,
         vertical=VERTICAL_EPSG.get(alignment.frame.vertical_datum),
-        compress="zstd",
         nodata=float("nan"),
         tags={"SOFTWARE": "Skyquilt"} | about,
         band_units=("m",) if alignment.frame.metric else (),
