@@ -83,6 +83,7 @@ def test_new_photos_lie_where_a_new_adjustment_would_put_them(flown, former, gro
     assert residual == pytest.approx(usual, abs=0.02)
 
 
+@pytest.mark.slow
 def test_photos_far_from_the_new_ones_stay(flown, former, grown):
     stayed = {i for i, p in former.poses.items() if same_pose(p, grown.poses[i])}
     linked = {i: set() for i in range(56)}

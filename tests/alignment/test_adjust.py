@@ -244,6 +244,7 @@ def test_an_undetermined_system_has_no_covariance():
         assert covariance(nothing, block.start) is None
 
 
+@pytest.mark.slow
 def test_an_error_that_all_tilts_share_moves_the_block_as_its_covariance_says():
     """A strip of two cameras, with a lens that is adjusted: the same adjustment with one camera's
     measured attitudes turned by one deviation about the same axis of their own.

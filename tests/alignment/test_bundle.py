@@ -154,6 +154,7 @@ def test_a_block_is_found(plain):
     assert camera.sigmas is not None and 0.5 < camera.sigmas[0] < 10 and camera.sigmas[8] > 0
 
 
+@pytest.mark.slow
 def test_a_block_that_is_soon_adjusted_again_is_found_nearly_as_well(plain):
     flown, thorough = plain
     quick = flown.aligned(thorough=False)
@@ -162,6 +163,7 @@ def test_a_block_that_is_soon_adjusted_again_is_found_nearly_as_well(plain):
     assert 0.02 < relative_error(flown, quick) < 1.2 * relative_error(flown, thorough)
 
 
+@pytest.mark.slow
 def test_large_surveys_are_placed_as_well_from_fewer_observations(plain):
     """As if 18 photos were many; the truth is as near as from all observations."""
     flown, usual = plain
@@ -262,6 +264,7 @@ def test_a_mirrored_camera_is_the_turned_file_s():
     assert camera.mirrored().mirrored() == camera
 
 
+@pytest.mark.slow
 def test_yaws_that_lie_do_not_matter(plain):
     """A line whose reported yaw is half a turn off, but whose files nobody turned."""
     flown = Flown(yaw_lies=range(6, 12))
@@ -292,6 +295,7 @@ def test_two_blocks_are_both_kept():
     assert len(found.poses) == 18
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known", [(), (0,), (13,)])
 def test_of_two_blocks_those_are_kept_whose_place_is_known(known):
     """Positions of a block's photos tell its place; without any, only the largest has one. That has

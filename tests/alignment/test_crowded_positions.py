@@ -50,6 +50,7 @@ def test_positions_that_crowd_are_told(noise_m, seed):
         assert np.isnan(own.map_C[:2]).all() and own.map_C[2] == told.map_C[2]
 
 
+@pytest.mark.slow
 def test_a_map_without_them_has_its_scale_from_the_heights():
     survey = flown()
     priors = at_one_place(survey, 1.5)

@@ -48,6 +48,7 @@ def test_one_photo_without_links_places_no_block():
     assert found.frame.crs is None and set(found.poses) == set(range(10))
 
 
+@pytest.mark.slow
 def test_as_many_photos_of_another_place_are_the_map():
     """And the block whose place nothing tells is left out: it would lie anywhere."""
     beside = [(x, y, 45.0, 20.0, 0.0) for y in (60, 78) for x in (-60, -42, -24, -6, 12)]

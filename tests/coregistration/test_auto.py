@@ -120,6 +120,7 @@ def test_perspective_is_freed_where_the_pictures_show_it(auto):
     assert error(found.b_H_a, truth, SMALL) < 0.6
 
 
+@pytest.mark.slow
 def test_measured_values_with_gaps(auto):
     truth = turned(1.0, 33.0, SMALL, SMALL)
     a, b = pair(truth, SMALL, seed=8, shape_a=SMALL)
@@ -128,6 +129,7 @@ def test_measured_values_with_gaps(auto):
     assert found and error(found.b_H_a, truth, SMALL) < 0.5
 
 
+@pytest.mark.slow
 def test_inliers_lie_where_the_transform_puts_them(auto):
     truth = turned(0.9, -20.0, SMALL, SMALL)
     a, b = pair(truth, SMALL, seed=9, shape_a=SMALL)
@@ -290,6 +292,7 @@ def test_rows_of_crops_tell_no_place_along_them(auto, degrees):
     assert isinstance(outcome, RefusedRegistration)
 
 
+@pytest.mark.slow
 def test_faults_of_a_detector_hide_nothing(auto):
     """Half a percent of pixels without a value, half a percent hot, a dead row."""
     truth = turned(0.9, 20.0, SMALL, SMALL, (5.0, -4.0))

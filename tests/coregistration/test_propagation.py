@@ -108,6 +108,7 @@ def test_wrong_pairs_are_outvoted_and_counted():
     assert found.evidence["pairs"] == 9 and 210 <= len(found.px_a) < 225
 
 
+@pytest.mark.slow
 def test_pairs_that_contradict_each_other_are_refused():
     """Each pair has a transform of its own; hundreds of correspondences of one do not agree."""
     x = np.linspace(-200, 200, 18)

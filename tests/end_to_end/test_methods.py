@@ -204,6 +204,7 @@ def test_a_sequence_that_cannot_be_used(mosaic, flight, tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_photos_that_a_sequence_does_not_name_are_left_out(mosaic, flight, tmp_path):
     (tmp_path / "order.txt").write_text("".join(f"SIM_000{k}.jpg\n" for k in (3, 2, 1)))
     told = mosaic(

@@ -213,6 +213,7 @@ def test_ste_tests_only_the_first_error_against_the_half_pixel(monkeypatch, erro
     assert RansacSte()(a, b).method == method and len(made) == tries
 
 
+@pytest.mark.slow
 def test_ste_as_printed_breaks_where_the_extension_holds():
     """(9) grows with the outliers: a quarter of gross ones is enough. A fixed threshold mends
     it.

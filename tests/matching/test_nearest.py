@@ -77,6 +77,7 @@ def flown():
     return features, overlap
 
 
+@pytest.mark.slow
 def test_retrieval_finds_what_overlaps(flown):
     features, overlap = flown
     found = Retrieval(neighbours=8, exhaustive_below=10)(features)
@@ -89,6 +90,7 @@ def test_retrieval_finds_what_overlaps(flown):
     assert len([p for p in found if overlap[p] > 0.1]) / len(found) > 0.75
 
 
+@pytest.mark.slow
 def test_retrieval_for_the_lost_only(flown):
     features, _ = flown
     method = Retrieval(neighbours=5, exhaustive_below=10)

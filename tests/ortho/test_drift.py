@@ -181,6 +181,7 @@ def test_a_ring_common_to_all_frames_is_found():
     assert left.std() < 0.2 * RING.std()
 
 
+@pytest.mark.slow
 def test_frames_without_a_pattern_have_none():
     views, frames = strip()
     assert Drift().patterns(views, frames, FLAT, GRID.bounds) == {}

@@ -100,6 +100,7 @@ def test_gains_are_found_again(lit):
     assert not any(found.uneven(v.photo) for v in views)
 
 
+@pytest.mark.slow
 def test_photos_that_overlap_much_are_sampled_less_and_gains_are_found_again(lit):
     """Samples per photo do not grow with the number of photos that show a point; with fewer of
     them, priors weigh as much less.

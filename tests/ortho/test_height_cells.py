@@ -31,6 +31,7 @@ def test_later_points_move_a_cell_part_of_the_way_or_replace_it():
     assert len(cells.add(np.zeros((0, 3)))[0]) == 0
 
 
+@pytest.mark.slow
 @given(
     st.lists(st.tuples(st.integers(-70, 70), st.integers(-70, 70), st.floats(-9, 9)), max_size=60),
     st.tuples(*[st.integers(-80, 80)] * 2),

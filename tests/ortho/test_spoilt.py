@@ -30,6 +30,7 @@ def shown(alignment, thumbnails, fixed=None):
     return spoilt_parts(alignment, lambda k: details[k], thumbnails, names, fixed or {})
 
 
+@pytest.mark.slow
 def test_white_frames_are_neither_overexposed_nor_marks_nor_fog():
     """They are not drawn at all (`imaging.blank`); one photo is overexposed besides."""
     alignment = flight(12, apart=6.0)
@@ -166,6 +167,7 @@ def written(picture):
     return picture
 
 
+@pytest.mark.slow
 def test_a_cross_and_a_scale_yield_though_they_have_few_features():
     alignment = flight(12, apart=6.0)
     clean = pictures(alignment)
@@ -192,6 +194,7 @@ def scratched(picture):
     return np.where(line, 0.5 * picture + 110, picture)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("mark", "part"), [(covered, 0.98), (scratched, 1.0)])
 def test_wide_marks_and_those_that_the_ground_shines_through_yield(mark, part):
     alignment = flight(12, apart=6.0)
@@ -276,6 +279,7 @@ def test_ground_that_two_photos_show_or_one_tells_of_no_spots(apart):
     assert shown(alignment, grey) == ({}, ())
 
 
+@pytest.mark.slow
 def test_a_road_in_the_middle_of_every_picture_is_no_dust():
     """One line flown along a dark road: each photo has it at the same place, as has the ground."""
     ground = textured().copy()

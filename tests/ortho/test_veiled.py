@@ -97,6 +97,7 @@ def test_a_photo_in_fog_yields_altogether(alignment, clean):
     assert list(marks) == [5] and (marks[5].room < 0).mean() > 0.8  # other photos do not show all
 
 
+@pytest.mark.slow
 def test_clear_photos_stay_as_they_are(alignment, clean):
     assert found(alignment, clean) == {}
     # light differs from photo to photo, and within one under a cloud's shadow

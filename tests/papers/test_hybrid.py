@@ -137,6 +137,7 @@ def test_a_noisy_strip_becomes_a_strip(optimise):
     assert all(0.7 < j.score <= 1 for j in found.joins)
 
 
+@pytest.mark.slow
 def test_earlier_photos_stay():
     flight = fly(line(6, step=20.0), gps=1.5, seed=3)
     some = Hybrid(optimise=Surfaces(), across=200)(

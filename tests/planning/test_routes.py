@@ -100,6 +100,7 @@ def test_the_bound_is_below_the_best_plan(seed):
     assert 0.6 * best < bound <= best + 1e-9
 
 
+@pytest.mark.slow
 def test_what_several_drones_must_visit_they_fly_to():
     """A far cluster that takes one drone longer than both: both fly there, whereas the shortest
     forest is one flight there and a short one.

@@ -74,6 +74,7 @@ def test_a_shifted_map_is_all_bias(tmp_path, ground, shift):
     assert 0.001 < result.relative.median_px < 0.05
 
 
+@pytest.mark.slow
 def test_a_warped_map_gives_back_its_field(tmp_path, ground):
     y, x = np.mgrid[: ground.shape[0], : ground.shape[1]]
     dx, dy = 30 + 12 * np.sin(x / 250), -10 + 0.012 * (y - 600)

@@ -73,6 +73,7 @@ def test_jpeg_is_as_good_as_another_encoder_s(tmp_path, bands):
         assert source.tags(ns="IMAGE_STRUCTURE")["JPEG_QUALITY"] == "85"
 
 
+@pytest.mark.slow
 def test_jpeg_with_mask(tmp_path):
     array, valid = picture(1500, 2100), disc(1500, 2100)
     write_array(tmp_path / "a.tif", array, spec_for(array, compress="jpeg", mask=True), valid)
@@ -199,6 +200,7 @@ def test_tiles_without_a_valid_pixel_open_in_programs_that_know_no_missing_ones(
     assert_valid_cog(tmp_path / "a.tif")
 
 
+@pytest.mark.slow
 def test_empty_tiles_that_would_double_the_file_take_no_room(tmp_path):
     array = np.full((4096, 4096, 3), 77, np.uint8)
     valid = np.zeros((4096, 4096), bool)

@@ -66,6 +66,7 @@ def test_rasters_are_those_of_the_files(run, finished):
         run.raster(bounds=(0, 0, 1, 1))
 
 
+@pytest.mark.slow
 def test_xarray_has_coordinates_and_unit(run):
     pytest.importorskip("xarray")
     found = run.xarray("heights")

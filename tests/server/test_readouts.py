@@ -72,6 +72,7 @@ def test_a_saved_part_is_the_map_s_own_pixels(web, finished):
     assert z.size > 1000 and np.array_equal(z, expected, equal_nan=True)
 
 
+@pytest.mark.slow
 def test_a_saved_part_leaves_no_file(web, finished, tmp_path, monkeypatch):
     """Neither once it is sent, nor where it cannot be written, nor where its client is gone."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))

@@ -109,6 +109,7 @@ def test_an_offset_is_found_where_the_flight_turns(shift, seed):
     assert abs(found.seconds - shift) < 3 * found.sigma_s
 
 
+@pytest.mark.slow
 def test_a_clip_that_begins_after_its_positions_end_is_found_in_them(tmp_path):
     """Positions two minutes late: further off than clocks usually are."""
     times = np.arange(0, 60, 0.2)
