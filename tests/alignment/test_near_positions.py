@@ -23,6 +23,8 @@ HOVER = [
 ]
 WIDE = [(x, y, HEIGHT, 0.0, 0.0) for y in (0, 18, 36) for x in (-40, -20, 0, 20, 40)]
 GPS_M, BAROMETER_M = 2.0, 0.5
+ALIKE = np.zeros(2)
+"""Both kinds of receivers are as likely."""
 
 
 def flown(places, seed, gps=GPS_M, height_off=0.0):
@@ -83,7 +85,7 @@ def test_their_headings_tell_where_north_is():
     assert off(survey, turned)[1] == pytest.approx(30, abs=1.5)
     # 10 degrees by positions as stated, 1.4 if their errors last, 5 by headings
     loose = np.degrees(np.array([1.5, 0.2]) / np.sqrt(4 * 18))
-    left = 30 - weighed(30.0, loose, 5.0)[0]
+    left = 30 - weighed(30.0, loose, 5.0, ALIKE)[0]
     assert left == pytest.approx(30 * 25 / (25 + loose[0] ** 2), abs=0.5)  # they do not, it shows
     found = told_besides(turned, priors, 0.0)
     assert off(survey, found)[1] == pytest.approx(left, abs=1.5)
@@ -116,6 +118,20 @@ def test_positions_that_tell_scale_and_direction_are_not_touched():
     for survey in (flown(WIDE, 0), flown(SQUARE, 0, gps=0.02, height_off=9.0)):
         found = adjusted(survey)
         assert told_besides(found, survey.priors, 0.0) is found
+
+
+@pytest.mark.parametrize("noise", [0.05, 2.0])
+def test_positions_that_lie_as_the_photos_do_tell_the_scale_whatever_they_state(noise):
+    """Six photos within 23 m, and heights of a take-off place 9 m above the ground."""
+    places = [(9.0 * i, 11.5 * k, HEIGHT, 180.0 * i, 0.0) for i in range(2) for k in range(3)]
+    survey = flown(places, 2, gps=noise, height_off=9.0)
+    survey.priors = [replace(p, sigma_C=np.array([2.0, 2.0, 3.0])) for p in survey.priors]
+    found = adjusted(survey)
+    if noise < 0.2:
+        assert off(survey, found)[0] < 0.04  # by heights 0.15
+        assert not any("so near to each other" in note for note in found.notes)
+    else:
+        assert any("so near to each other" in note for note in found.notes)
 
 
 def test_positions_of_photos_that_tell_no_height_count():
@@ -163,7 +179,7 @@ def test_the_weights_err_less_than_either_scale_and_than_any_fixed_weight():
     by_positions = rng.normal(0, np.where(rng.random(n) < 0.5, *loose))
     by_heights = rng.normal(0, told, n)
     apart = by_heights - by_positions
-    found = [weighed(a, loose, told) for a in apart]
+    found = [weighed(a, loose, told, ALIKE) for a in apart]
     error = np.sqrt(
         np.mean([(p + (f[0] if f else 0)) ** 2 for p, f in zip(by_positions, found, strict=True)])
     )
@@ -175,7 +191,7 @@ def test_the_weights_err_less_than_either_scale_and_than_any_fixed_weight():
 
 def test_exact_positions_keep_their_scale_and_none_leave_it_to_the_heights():
     told = 0.06
-    assert weighed(0.1, np.array([1e-4, 1e-4]), told)[0] == pytest.approx(0, abs=1e-5)
-    assert weighed(0.2, np.array([50.0, 50.0]), told)[0] == pytest.approx(0.2, rel=1e-4)
-    assert weighed(0.0, np.array([0.1, 0.02]), told)[0] == 0
-    assert weighed(3.0, np.array([0.1, 0.02]), told) is None  # a contradiction
+    assert weighed(0.1, np.array([1e-4, 1e-4]), told, ALIKE)[0] == pytest.approx(0, abs=1e-5)
+    assert weighed(0.2, np.array([50.0, 50.0]), told, ALIKE)[0] == pytest.approx(0.2, rel=1e-4)
+    assert weighed(0.0, np.array([0.1, 0.02]), told, ALIKE)[0] == 0
+    assert weighed(3.0, np.array([0.1, 0.02]), told, ALIKE) is None  # a contradiction

@@ -90,7 +90,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 86
+    version: ClassVar[int] = 87
 
     def __call__(
         self,

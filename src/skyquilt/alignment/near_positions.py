@@ -3,8 +3,8 @@ large the map is and where its north lies: a pair, a hover, a panorama, a handfu
 above take-off and reported headings tell it besides.
 
 Receivers whose errors last longer than such a flight tell distances far better than each position.
-Which kind a receiver is, few photos show only by how well positions agree with heights and
-headings: both kinds are weighed by how likely they make the difference.
+Which kind a receiver is shows in how well positions lie as the photos do, and in how well they
+agree with heights and headings: both kinds are weighed by how likely they make the differences.
 """
 
 from collections.abc import Sequence
@@ -53,8 +53,7 @@ def told_besides(found: Alignment, priors: Sequence[Prior], ground_m: float) -> 
         return found
     scale = _scale(found, priors, held, high, ground_m)
     heading = _heading(found, priors, held)
-    says = [told.note for told in (scale, heading) if told]
-    if not says:
+    if not scale and not heading:
         return found
     if scale and found.accuracy is not None:
         accuracy = replace(found.accuracy, sigma_m=scale.narrowed * found.accuracy.sigma_m)
@@ -63,6 +62,7 @@ def told_besides(found: Alignment, priors: Sequence[Prior], ground_m: float) -> 
     turn = np.array([[np.cos(a), np.sin(a), 0], [-np.sin(a), np.cos(a), 0], [0, 0, 1]])
     middle = np.mean([found.poses[i].map_C for i in held], axis=0)
     found = found.carried(turn, 1 + scale.change if scale else 1.0, middle)
+    says = [told.note for told in (scale, heading) if told and told.note]
     return replace(found, notes=(*found.notes, *says))
 
 
@@ -71,7 +71,7 @@ class _Told:
     """What metadata tell of a map besides its positions."""
 
     note: str
-    """What the user should know."""
+    """What the user should know; empty where positions tell enough."""
     change: float = 0.0
     """Of the scale, as a share; of the direction, rad clockwise."""
     narrowed: float = 1.0
@@ -94,6 +94,29 @@ def _loose(
     return 1 / np.sqrt(np.maximum([stated, lasting], 1e-6))
 
 
+def _kinds(found: Alignment, priors: Sequence[Prior], held: Sequence[int]) -> NDArray[np.float64]:
+    """Log-likelihoods (2,) of how positions lie against the photos, but for a similarity in the
+    plane: with their stated deviations, and where the receiver's errors last.
+    """
+    x = np.array([found.poses[i].map_C[:2] for i in held]) @ (1, 1j)
+    y = np.array([priors[i].map_C[:2] for i in held]) @ (1, 1j)
+    stated = np.array([priors[i].sigma_C[0] for i in held])
+    return np.array([_likely(x, y, by) for by in (stated, np.minimum(stated, LASTING_M))])
+
+
+def _likely(
+    x: NDArray[np.complex128], y: NDArray[np.complex128], sigma: NDArray[np.float64]
+) -> float:
+    """Log-likelihood of y (n,), of a deviation (n,) per axis, as a similarity of x (n,), but for
+    a constant; nothing is told by two.
+    """
+    w = sigma**-2
+    x, y = x - np.average(x, weights=w), y - np.average(y, weights=w)
+    off = y - x * (w @ (np.conj(x) * y)) / max(float(w @ np.abs(x) ** 2), 1e-12)
+    free = max(len(x) - 2, 0)
+    return float(-2 * free * np.log(sigma).mean() - w @ np.abs(off) ** 2 / 2)
+
+
 def _loose_ground(found: Alignment, held: Sequence[int]) -> float:
     """Deviation of the scale of the ground, as a share, as that of its points tells: lines of
     sight that meet at small angles leave it less certain than the positions.
@@ -107,20 +130,23 @@ def _loose_ground(found: Alignment, held: Sequence[int]) -> float:
     return float(np.median(off[outer] / np.maximum(far[outer], 1e-6)))
 
 
-def weighed(apart: float, loose: NDArray[np.float64], told: float) -> tuple[float, float] | None:
+def weighed(
+    apart: float, loose: NDArray[np.float64], told: float, kinds: NDArray[np.float64]
+) -> tuple[float, float, float] | None:
     """The change of what positions tell, with the deviations `loose` (2: as stated, and where their
-    errors last), towards what lies `apart` and has the deviation `told`, and the share of the
-    stated deviation that is left; None where they contradict each other.
+    errors last, of the log-likelihoods `kinds`), towards what lies `apart` and has the deviation
+    `told`, the share of the stated deviation that is left, and the deviation of what the positions
+    tell alone; None where they contradict each other.
     """
     whole = loose**2 + told**2
     if abs(apart) > CONTRADICTED * np.sqrt(whole[0]):
         return None
-    likely = np.exp(-(apart**2) / (2 * whole)) / np.sqrt(whole)
-    likely /= likely.sum()
+    likely = kinds - apart**2 / (2 * whole) - np.log(whole) / 2
+    likely = np.exp(likely - likely.max()) / np.exp(likely - likely.max()).sum()
     share = loose**2 / whole
     change = apart * float(likely @ share)
     left = likely @ (share * told**2 + (apart * share - change) ** 2)
-    return change, float(np.sqrt(left) / loose[0])
+    return change, float(np.sqrt(left) / loose[0]), float(np.sqrt(likely @ loose**2))
 
 
 def _scale(
@@ -141,7 +167,8 @@ def _scale(
     if not high > 0:
         return None
     uneven = float(np.hypot(EVEN, (top - low) / (2 * high)))
-    to = weighed(above / high - 1, loose, uneven * above / high)
+    kinds = _kinds(found, priors, held)
+    to = weighed(above / high - 1, loose, uneven * above / high, kinds)
     if to is None:
         return _Told(
             f"Positions near to each other tell that the photos were taken {high:.0f} m above the"
@@ -149,10 +176,12 @@ def _scale(
             " higher or lower, or the map is too large or small. Control points would tell."
         )
     return _Told(
-        f"{_known(found, held, 'scale', f'{min(100 * loose[0], 100):.0f} %')}. So it rests on"
+        f"{_known(found, held, 'scale', f'{min(100 * to[2], 100):.0f} %')}. So it rests on"
         " heights above take-off, too, which tell it where the ground is as high as the place of"
-        " take-off. Control points would settle it.",
-        *to,
+        " take-off. Control points would settle it."
+        if to[2] > LOOSE_SCALE
+        else "",
+        *to[:2],
     )
 
 
@@ -166,12 +195,16 @@ def _heading(found: Alignment, priors: Sequence[Prior], held: Sequence[int]) -> 
     by = common_angle_deg(off, ALIKE_DEG)  # files that were turned have another one
     if by is None:
         return None
-    to = weighed(by, loose, float(np.median([priors[i].sigma_yaw_deg for i in told])))
+    sigma = float(np.median([priors[i].sigma_yaw_deg for i in told]))
+    kinds = _kinds(found, priors, held)
+    to = weighed(by, loose, sigma, kinds)
     if to is None:
         return None  # told for each photo (`alignment.conflicts`)
     return _Told(
-        f"{_known(found, held, 'direction', f'{min(loose[0], 180):.0f} degrees')}. So it rests on"
-        " their headings, too.",
+        f"{_known(found, held, 'direction', f'{min(to[2], 180):.0f} degrees')}. So it rests on"
+        " their headings, too."
+        if to[2] > LOOSE_DEG
+        else "",
         float(np.radians(to[0])),
     )
 
