@@ -2,7 +2,8 @@
 
 A frame is named by its time, because frame numbers do not tell where a frame is in a clip of
 variable frame rate. Pixels are in sensor coordinates: rotation flags are not applied. Those of
-recordings with oblong pixels (analog cameras, HDV) are made square, as players show them.
+recordings with oblong pixels (analog cameras, HDV) are made square, as players show them, and
+interlaced frames have the lines of one field.
 """
 
 import os
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.errors import UnreadablePhotoError
+from skyquilt.video.interlaced import first_field
 
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # its complaints would go to the terminal
 # a container that names other files or addresses shall not open any
@@ -91,9 +93,10 @@ class Decoder:
         if not self._plane:
             code = cv2.COLOR_BGR2GRAY if self._grey else cv2.COLOR_BGR2RGB
             pixels = cv2.cvtColor(pixels, code)
+        frame = first_field(np.asarray(pixels, dtype=np.uint8))
         if self._oblong:
-            pixels = cv2.resize(pixels, (self.width, self.height))
-        return self._time, np.asarray(pixels, dtype=np.uint8)
+            frame = np.asarray(cv2.resize(frame, (self.width, self.height)), dtype=np.uint8)
+        return self._time, frame
 
     def skip(self) -> bool:
         """Goes on by one frame; False after the last one."""

@@ -38,7 +38,7 @@ class Looker:
     """Corners that must agree for a motion to count."""
     chunk: int = 300
     """Looks that are stored at once."""
-    version: int = 2
+    version: int = 3
     """Changes when the results do."""
 
     def step(self, fps: float) -> int:
