@@ -20,9 +20,9 @@ from tests.live.clock import Clock
 class Watched:
     """A folder, what was taken from it, and the ledger."""
 
-    def __init__(self, home, out="out"):
-        self.folder, self.out = home / "in", home / out
-        self.folder.mkdir()
+    def __init__(self, home, out="out", inbox="in"):
+        self.folder, self.out = home / inbox, home / out
+        self.folder.mkdir(parents=True)
         self.out.mkdir(parents=True)
         self.ledger = Ledger(self.out, write=True)
         self.intake = Intake(self.ledger, Inbox(self.ledger, self.out / "photos"), LiveSettings())
@@ -104,6 +104,31 @@ def test_a_complete_file_is_taken_without_waiting(tmp_path, flight, monkeypatch)
     shutil.copyfile(flight.photos[2], found.folder / "drone-2" / "c.jpg")
     assert [d.name for d in found.watch.look()] == ["c.jpg"]
     assert found.ledger.row("select source from photo where name = 'c.jpg'") == ("drone-2",)
+
+
+@pytest.mark.parametrize(
+    ("way", "drone"),
+    {
+        ("in", "east/DCIM/100MEDIA"): "east",
+        ("in", "west/DCIM/100MEDIA"): "west",
+        ("in", "west/DCIM/101MEDIA"): "west",
+        ("in", "DCIM/100MEDIA"): "in",
+        ("in", "west/flight-2"): "west/flight-2",
+        ("in", "100MEDIA"): "100MEDIA",
+        ("east/DCIM", "."): "east",
+        ("east/dcim", "100media"): "east",
+    }.items(),
+)
+def test_a_source_is_a_drone_not_a_folder_of_its_card(tmp_path, flight, way, drone):
+    """What is learned of a drone goes on where its camera begins another folder, and is not mixed
+    with that of another one, whose card has the same folders.
+    """
+    inbox, below = way
+    found = Watched(tmp_path, inbox=inbox)
+    (found.folder / below).mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(flight.photos[0], found.folder / below / "a.jpg")
+    assert [d.name for d in found.look(1.2)] == ["a.jpg"]
+    assert found.ledger.row("select source from photo") == (drone,)
 
 
 def test_files_that_came_together_are_taken_in_order_of_names(watched, flight):

@@ -1,9 +1,11 @@
 """Watches a folder into which photos are copied, and accepts each photo when it is complete."""
 
 import os
+import re
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 from skyquilt.errors import UnreadablePhotoError, UsageError
@@ -35,6 +37,8 @@ PATIENCE_S = 4.0
 """A truncated file is refused when it has not grown for this time, in s. It is checked again when
 it changes.
 """
+CARD, ON_CARD = "DCIM", re.compile(r"[1-9]\d\d\w{5}")
+"""The folder of a camera's card, and the folders in it."""
 Stamp = tuple[int, int]
 """Size and modification time of a file."""
 
@@ -148,8 +152,7 @@ class Watch:
     def _take(
         self, path: Path, key: str, known: Growing, reason: str
     ) -> Iterator[Accepted | Refused]:
-        source = path.parent.relative_to(self.folder).as_posix()
-        source = self.folder.name if source == "." else source
+        source = drone_of(path.parent, self.folder)
         done: list[Accepted | Refused] = []
         if reason:
             done.append(self.intake.refuse(path.name, source, reason))
@@ -238,6 +241,24 @@ class Watch:
             return str(error)
         photo = read_photo(path, most_mp=self.intake.settings.most_mp)
         return photo.reason if isinstance(photo, RejectedPhoto) else ""
+
+
+def drone_of(folder: Path, inbox: Path) -> str:
+    """The drone whose photos lie in a folder: the way to it from the inbox, or else the inbox's
+    name. The folders of a camera's card do not count: a drone begins one after another, and those
+    of all drones have the same names.
+    """
+    way, to_inbox = (_without_card(f.absolute().parts) for f in (folder, inbox))
+    return "/".join(way[len(to_inbox) :]) or to_inbox[-1]
+
+
+def _without_card(parts: Sequence[str]) -> list[str]:
+    """Parts of a path without `DCIM` and `100MEDIA` in it (the standard DCF, JEITA CP-3461)."""
+    return [
+        part
+        for above, part in pairwise(("", *parts))
+        if part.upper() != CARD and not (above.upper() == CARD and ON_CARD.fullmatch(part))
+    ]
 
 
 def _stored(key: str) -> str:

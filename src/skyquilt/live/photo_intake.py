@@ -65,9 +65,14 @@ def shown_name(name: str) -> str:
     """A name for display: the last part of a path, without control characters, of limited length.
     It is never used as a path.
     """
-    last = re.split(r"[\\/]", name)[-1] or "photo"
-    text = "".join(c if unicodedata.category(c)[0] != "C" else "?" for c in last)
-    return text[:NAME] or "photo"
+    return shown_source(re.split(r"[\\/]", name)[-1]) or "photo"
+
+
+def shown_source(source: str) -> str:
+    """What names a drone, for display: as `shown_name`, but a path stays whole, since the cards of
+    all drones end alike.
+    """
+    return "".join(c if unicodedata.category(c)[0] != "C" else "?" for c in source[:NAME])
 
 
 class Intake:
@@ -96,7 +101,7 @@ class Intake:
             OutputError: the disk is full, or the survey's folder gone; this photo was not accepted,
             and no accepted photo is lost.
         """
-        name, source = shown_name(name), shown_name(source)
+        name, source = shown_name(name), shown_source(source)
         if self._full():
             return self.refuse(
                 name, source, f"this map takes {self.settings.most_photos} photos at most"
@@ -137,7 +142,7 @@ class Intake:
 
     def refuse(self, name: str, source: str, reason: str) -> Refused:
         """Records a refused file and reports it."""
-        name, source, reason = shown_name(name), shown_name(source), plain(reason, 500)
+        name, source, reason = shown_name(name), shown_source(source), plain(reason, 500)
         self.ledger.refuse(name, source, reason)
         return Refused(name=name, reason=reason)
 

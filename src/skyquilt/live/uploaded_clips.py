@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from skyquilt.errors import OutputError
 from skyquilt.live.inbox import SEEN, is_clip, synced
-from skyquilt.live.photo_intake import Accepted, Intake, Refused, shown_name
+from skyquilt.live.photo_intake import Accepted, Intake, Refused, shown_name, shown_source
 from skyquilt.outside import open_regular, put_in_place, read_bounded, remove_folder
 from skyquilt.video.container import is_video
 from skyquilt.video.tracks import TRACK_ENDINGS
@@ -50,7 +50,7 @@ def bring_clip(intake: Intake, file: Path, name: str, source: str) -> Waiting | 
     Raises:
         OutputError: the disk is full.
     """
-    name, source = shown_name(name), shown_name(source)
+    name, source = shown_name(name), shown_source(source)
     folder = _waiting(intake)
     path = Path(name)
     home = folder / _key(source, path.stem)
@@ -162,7 +162,7 @@ def _age(path: Path) -> float:
 def _about(home: Path) -> dict[str, str]:
     try:
         said = json.loads(read_bounded(home / _ABOUT, 100_000))
-        return {"name": shown_name(str(said["name"])), "source": shown_name(str(said["source"]))}
+        return {"name": shown_name(str(said["name"])), "source": shown_source(str(said["source"]))}
     except (OSError, ValueError, LookupError, TypeError):
         return {"name": "clip", "source": "upload"}
 
