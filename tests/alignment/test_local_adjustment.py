@@ -118,3 +118,13 @@ def test_positions_hold_a_map_that_has_drifted():
     setup = held_setup(asked, plane, asked.links)
     kept = np.isfinite(without_false_positions(setup, asked).base.C0[:, 0])
     assert kept.tolist() == [True, True, True, True, False]
+
+
+def test_points_that_only_photos_of_one_place_show_are_no_ground():
+    """A hover at the end of a line, an exposure bracket, a copy of a photo: their rays meet
+    anywhere, and the growing map was drawn on heights of tens of metres.
+    """
+    line = [(0.0, 22.0 * k, 50.0, 0.0, 0.0) for k in range(-2, 3)]
+    flown = Slanting([*line, (0.05, 44.05, 50.0, 0.0, 0.0)], seed=1)
+    found = LocalAdjustment()(window_on(flown, held={0, 1, 2, 3})).xyz
+    assert len(found) > 40 and np.abs(found[:, 2] - np.median(found[:, 2])).max() < 5.0

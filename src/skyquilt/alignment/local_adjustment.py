@@ -22,7 +22,7 @@ from skyquilt.alignment.similarity_graph import fit_similarity
 from skyquilt.alignment.stages import prune
 from skyquilt.alignment.start import Start
 from skyquilt.alignment.tracks import Tracks, build_tracks, thin
-from skyquilt.alignment.triangulate import triangulated
+from skyquilt.alignment.triangulate import STEADY_HIGH, polish, triangulated
 from skyquilt.geometry.camera import rays
 from skyquilt.model.camera import Camera
 from skyquilt.model.features import Features, Link
@@ -86,7 +86,7 @@ class AdjustedWindow:
     observations: int
     """Number of observations of the new photo."""
     xyz: NDArray[np.float64]
-    """(P, 3) ground points in m."""
+    """(P, 3) ground points in m whose heights are told."""
     dropped: tuple[tuple[int, int], ...]
     """Links (a, b) that contradict the others."""
 
@@ -116,7 +116,7 @@ class LocalAdjustment:
     """Links that put a photo further apart than this share of the flying height contradict each
     other.
     """
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 5
 
     def __call__(self, window: Window) -> AdjustedWindow | NotAdjusted:
         """Places the new photo and refines the free ones."""
@@ -147,9 +147,18 @@ class LocalAdjustment:
             poses=moved,
             camera=key + TURNED if setup.turned[window.new] else key,
             observations=observations,
-            xyz=state.X,
+            xyz=steady(problem, state),
             dropped=dropped,
         )
+
+
+def steady(problem: Problem, state: State) -> Array:
+    """The points (P, 3) whose rays tell their height; of what only photos of one place show (a
+    hover, a bracket, copies), rays meet anywhere.
+    """
+    _, sigma_z = polish(problem, state, iterations=1)
+    high = abs(float(np.median(state.C[:, 2]) - np.median(state.X[:, 2])))
+    return np.asarray(state.X[sigma_z < STEADY_HIGH * high])
 
 
 def without_false_positions(setup: Setup, window: Window) -> Setup:

@@ -11,7 +11,7 @@ from skyquilt.alignment.problem import Problem, State, residuals_px
 from skyquilt.alignment.setup import TURNED, Setup
 from skyquilt.alignment.stages import heights_above, prune
 from skyquilt.alignment.tracks import Tracks
-from skyquilt.alignment.triangulate import polish, triangulated
+from skyquilt.alignment.triangulate import STEADY_HIGH, polish, triangulated
 from skyquilt.model.camera import PARAMETERS
 from skyquilt.model.poses import Accuracy, Alignment, TiePoints, no_ties
 
@@ -95,7 +95,7 @@ def ground_points(tracks: Tracks, setup: Setup, state: State) -> TiePoints:
     parts, first = [no_ties()], 0
     while found:
         ties, sigma_z = found.pop(0)
-        keep = (sigma_z < 0.05 * height)[ties.point]
+        keep = (sigma_z < STEADY_HIGH * height)[ties.point]
         points, number = np.unique(ties.point[keep], return_inverse=True)
         values = {n: getattr(ties, n)[keep] for n in ("photo", "px", "residual_px")}
         point = (first + number).astype(ties.point.dtype)

@@ -12,6 +12,10 @@ from skyquilt.geometry.camera import undistort
 from skyquilt.model.camera import PARAMETERS, Camera
 
 Array = NDArray[np.float64]
+STEADY_HIGH = 0.05
+"""Standard deviation of a point's height, as a share of the flying height, from which its rays do
+not tell it: those of photos of one place hardly converge.
+"""
 
 
 def intersect(
