@@ -6,9 +6,15 @@ import numpy as np
 import pytest
 
 from skyquilt.alignment.aligners import Auto, ByLinks, by_pose
-from skyquilt.alignment.crowded_positions import ONE_PLACE, believed, without_crowded
+from skyquilt.alignment.crowded_positions import (
+    ONE_PLACE,
+    believed,
+    one_place_notes,
+    without_crowded,
+)
 from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.model.photo import ControlPoint
+from tests.alignment.surveys import alignment
 from tests.alignment.test_oblique_start import FRAME, Slanting
 
 LINES = [(x, y, 45.0, 20.0, 0.0) for y in (-40, -20, 0, 20) for x in (-36, -18, 0, 18, 36)]
@@ -127,3 +133,17 @@ def test_oblique_photos_whose_positions_are_those_of_the_remote_control():
     )
     _, (note,) = without_crowded(inputs(survey, at_one_place(survey, 1.5)))
     assert "remote control" in note
+
+
+def test_a_hover_before_a_flight_is_no_panorama():
+    """Most photos were taken where the flight began, and so were most of the pairs that show the
+    same: the flight tells the heights of the ground all the same.
+    """
+    hover, flight = [(0.0, 0.0, 60.0, 20.0, 0.0)] * 8, [(x, 0.0, 60.0, 20.0, 0.0) for x in (20, 40)]
+    survey = Slanting([*hover, *flight])
+    given = inputs(survey, survey.priors)
+    poses, n = dict(enumerate(survey.truth)), len(survey.truth)
+    found = replace(alignment(n), poses=poses, blocks=(tuple(range(n)),))
+    assert one_place_notes(given, found) == ()
+    still = dict.fromkeys(range(n), survey.truth[0])
+    assert one_place_notes(given, replace(found, poses=still)) == (ONE_PLACE,)

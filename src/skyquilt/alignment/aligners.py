@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.addition import added, median_offset
 from skyquilt.alignment.bundle import Bundle
+from skyquilt.alignment.contradicted_control import control_notes
 from skyquilt.alignment.control import control_in_frame
 from skyquilt.alignment.copied_views import without_copied_views
 from skyquilt.alignment.crowded_positions import at_their_middle, one_place_notes
@@ -69,7 +70,7 @@ class ByLinks:
 
     bundle: Bundle = field(default_factory=Bundle)
     """The adjustment."""
-    version: ClassVar[int] = 17
+    version: ClassVar[int] = 18
     needs_links: ClassVar[bool] = True
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -100,7 +101,8 @@ class ByLinks:
             if p.position is None and p.attitude is None and p.focal.source == "guess"
         }
         found = without_copied_views(found, [p.name for p in inputs.photos], told, bare)
-        found = replace(found, notes=(*found.notes, *said, *one_place_notes(inputs)))
+        said += one_place_notes(inputs, found) + control_notes(found, inputs.photos, inputs.priors)
+        found = replace(found, notes=(*found.notes, *said))
         found = without_strange_blocks(with_loose_photos(found, inputs), inputs)
         return replace(of_placed(found), why=REQUESTED)
 
@@ -157,7 +159,7 @@ class Auto:
     """For linked photos."""
     pose: ByReport
     """For photos that only have positions."""
-    version: ClassVar[int] = 16
+    version: ClassVar[int] = 17
     needs_links: ClassVar[bool] = True
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:

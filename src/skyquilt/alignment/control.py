@@ -182,7 +182,8 @@ def hold_to_control(
         )
         problem, state = _moved(problem, state, *fit_similarity_3d(seen, level))
     else:
-        shift = np.nan_to_num(np.nanmedian(surveyed - seen, axis=0))
+        known = (d[np.isfinite(d)] for d in (surveyed - seen).T)
+        shift = np.array([np.median(d) if len(d) else 0.0 for d in known])
         problem, state = _moved(problem, state, 1.0, np.eye(3), shift)
     problem, state = with_points(problem, state, setup, fit)
     if not setup.georeferenced:
@@ -252,7 +253,7 @@ def residuals_of_control(
             error_m=x - c.xyz,
             reprojection_px=float(r),
             observations=len(placed_in(c, setup)[0]),
-            sigma_m=None if not c.check or np.isnan(s).any() else s,
+            sigma_m=None if np.isnan(s).any() else s,
         )
         for c, x, r, s in zip(control, X, rms, sigma, strict=True)
     )

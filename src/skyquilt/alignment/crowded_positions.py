@@ -42,6 +42,10 @@ ONE_PLACE = (
     " what is far from the middle, and the scale rests on the height above take-off."
 )
 """What is said of such photos."""
+FLOWN = 0.3
+"""A tenth of the photos lie further from most than this share of the height where a flight joins a
+hover; drones that take a panorama drift by less.
+"""
 FEWEST_CONTROL = 3
 """Control points that place a map without positions."""
 
@@ -126,11 +130,18 @@ def believed(found: Alignment, frame: MapFrame, priors: Sequence[Prior]) -> Sequ
     return without_places(priors) if frame.crs and not found.frame.crs else priors
 
 
-def one_place_notes(inputs: AlignmentInputs) -> tuple[str, ...]:
-    """A sentence on the photos of a panorama or a hover."""
-    if inputs.frame.crs is None or not within_noise(inputs.priors):
+def one_place_notes(inputs: AlignmentInputs, found: Alignment) -> tuple[str, ...]:
+    """A sentence on the photos of a panorama or a hover; not where some were `found` elsewhere:
+    then most were taken before the flight began.
+    """
+    if inputs.frame.crs is None or not within_noise(inputs.priors) or not _only_turned(inputs):
         return ()
-    return (ONE_PLACE,) if _only_turned(inputs) else ()
+    places = np.array([found.poses[i].map_C for i in found.held]).reshape(-1, 3)
+    if len(places):
+        away = np.linalg.norm(places[:, :2] - np.median(places[:, :2], axis=0), axis=1)
+        if np.quantile(away, 0.9) > FLOWN * (np.median(places[:, 2]) - found.ground_m):
+            return ()
+    return (ONE_PLACE,)
 
 
 def at_their_middle(inputs: AlignmentInputs) -> AlignmentInputs:

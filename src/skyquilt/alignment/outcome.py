@@ -20,6 +20,10 @@ SAMPLED = 400
 """Ground points whose accuracy is predicted, about."""
 LEAST_TOLD = 1e-3
 """Share of what is known of a photo's position that all others must tell, to predict it."""
+LEAST_SETTLED = 0.05
+"""Share of the tracks whose heights must be known: 0.5 and more are of a flight, 0.015 and less of
+photos from one place, where chance puts single points anywhere before the camera.
+"""
 UNDETERMINED = 0.4
 """A focal length whose deviation stays above this share of its prior's is not determined: what the
 metadata say of it counts for a sixth or more.
@@ -84,7 +88,8 @@ def leave_one_out(
 
 
 def ground_points(tracks: Tracks, setup: Setup, state: State) -> TiePoints:
-    """All tracks triangulated with the final poses; outliers and unstable points are removed.
+    """All tracks triangulated with the final poses; outliers and unstable points are removed. None
+    where next to no track is left: the photos were taken from one place.
 
     Of large surveys these are millions of observations, more than anything else in memory: what is
     found of a part of them is small, and the parts are joined one field at a time.
@@ -101,6 +106,8 @@ def ground_points(tracks: Tracks, setup: Setup, state: State) -> TiePoints:
         point = (first + number).astype(ties.point.dtype)
         parts.append(TiePoints(xyz=ties.xyz[points], point=point, **values))
         first += len(points)
+    if first < LEAST_SETTLED * tracks.count:
+        return no_ties()
     lists = {f.name: [getattr(p, f.name) for p in parts] for f in fields(TiePoints)}
     del parts
     return TiePoints(**{name: np.concatenate(lists.pop(name)) for name in list(lists)})

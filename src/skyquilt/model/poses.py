@@ -150,8 +150,8 @@ class ControlResidual:
     observations: int
     """Number of photos in which it was observed."""
     sigma_m: Array | None = None
-    """(3,) predicted deviation of `error_m` of a check point in m, the survey's included; None
-    where it is not known.
+    """(3,) predicted deviation of `error_m` in m, the survey's included; of a control point, which
+    holds the map, this is the most it can be. None where it is not known.
     """
 
 
