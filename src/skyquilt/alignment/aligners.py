@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.addition import added, median_offset
 from skyquilt.alignment.bundle import Bundle
-from skyquilt.alignment.contradicted_control import control_notes
 from skyquilt.alignment.control import control_in_frame
 from skyquilt.alignment.copied_views import without_copied_views
 from skyquilt.alignment.crowded_positions import at_their_middle, one_place_notes
@@ -101,8 +100,7 @@ class ByLinks:
             if p.position is None and p.attitude is None and p.focal.source == "guess"
         }
         found = without_copied_views(found, [p.name for p in inputs.photos], told, bare)
-        said += one_place_notes(inputs, found) + control_notes(found, inputs.photos, inputs.priors)
-        found = replace(found, notes=(*found.notes, *said))
+        found = replace(found, notes=(*found.notes, *said, *one_place_notes(inputs, found)))
         found = without_strange_blocks(with_loose_photos(found, inputs), inputs)
         return replace(of_placed(found), why=REQUESTED)
 

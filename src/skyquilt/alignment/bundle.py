@@ -7,6 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from skyquilt.alignment.adjust import covariance, with_common_tilts
+from skyquilt.alignment.contradicted_control import control_notes
 from skyquilt.alignment.control import Control, hold_to_control, residuals_of_control
 from skyquilt.alignment.determined import STATED_DEG, weak_photos
 from skyquilt.alignment.dominant_plane import levelled
@@ -171,6 +172,7 @@ class Bundle:
         own = taken(begun)
         done = hung(found, weak, own, begun.priors, features, links, begun.aside)
         done = told_besides(done, priors, ground_of(frame))
+        notes += control_notes(done, photos, priors) if control else ()
         return replace(done, notes=(*done.notes, *notes)) if notes else done
 
     def _in_space(self, begun: Beginning) -> bool:
