@@ -85,7 +85,7 @@ def test_their_headings_tell_where_north_is():
     assert off(survey, turned)[1] == pytest.approx(30, abs=1.5)
     # 10 degrees by positions as stated, 1.4 if their errors last, 5 by headings
     loose = np.degrees(np.array([1.5, 0.2]) / np.sqrt(4 * 18))
-    left = 30 - weighed(30.0, loose, 5.0, ALIKE)[0]
+    left = 30 - weighed(30.0, loose, 5.0, ALIKE).change
     assert left == pytest.approx(30 * 25 / (25 + loose[0] ** 2), abs=0.5)  # they do not, it shows
     found = told_besides(turned, priors, 0.0)
     assert off(survey, found)[1] == pytest.approx(left, abs=1.5)
@@ -181,17 +181,19 @@ def test_the_weights_err_less_than_either_scale_and_than_any_fixed_weight():
     apart = by_heights - by_positions
     found = [weighed(a, loose, told, ALIKE) for a in apart]
     error = np.sqrt(
-        np.mean([(p + (f[0] if f else 0)) ** 2 for p, f in zip(by_positions, found, strict=True)])
+        np.mean(
+            [(p + (f.change if f else 0)) ** 2 for p, f in zip(by_positions, found, strict=True)]
+        )
     )
     fixed = [np.sqrt(np.mean((by_positions + w * apart) ** 2)) for w in np.linspace(0, 1, 21)]
     assert 0.8 * min(fixed) < error < 0.95 * min(fixed)
-    stated = np.sqrt(np.mean([(loose[0] * f[1]) ** 2 for f in found if f]))
+    stated = np.sqrt(np.mean([(loose[0] * f.narrowed) ** 2 for f in found if f]))
     assert stated == pytest.approx(error, rel=0.05)  # what is left is what is told
 
 
 def test_exact_positions_keep_their_scale_and_none_leave_it_to_the_heights():
     told = 0.06
-    assert weighed(0.1, np.array([1e-4, 1e-4]), told, ALIKE)[0] == pytest.approx(0, abs=1e-5)
-    assert weighed(0.2, np.array([50.0, 50.0]), told, ALIKE)[0] == pytest.approx(0.2, rel=1e-4)
-    assert weighed(0.0, np.array([0.1, 0.02]), told, ALIKE)[0] == 0
+    assert weighed(0.1, np.array([1e-4, 1e-4]), told, ALIKE).change == pytest.approx(0, abs=1e-5)
+    assert weighed(0.2, np.array([50.0, 50.0]), told, ALIKE).change == pytest.approx(0.2, rel=1e-4)
+    assert weighed(0.0, np.array([0.1, 0.02]), told, ALIKE).change == 0
     assert weighed(3.0, np.array([0.1, 0.02]), told, ALIKE) is None  # a contradiction

@@ -9,6 +9,7 @@ import numpy as np
 from skyquilt.alignment.heights import absolute
 from skyquilt.model.photo import Datum, Photo
 from skyquilt.model.poses import Alignment, ControlResidual, Prior
+from skyquilt.photos.side_rows import sentence_of
 
 MISMARKED_PX = 5.0
 """Lines of sight to one point that miss one another by more, root mean square, were marked
@@ -27,8 +28,6 @@ err by, are told,
 HIGHER_M = 30.0
 """and so are heights that differ by more: receivers and barometers of drones err by less, mostly.
 """
-SHOWN = 8
-"""Points that a sentence names."""
 
 
 def control_notes(
@@ -47,7 +46,7 @@ def control_notes(
             " and down; correct that file.",
         )
     notes = [
-        f"The marks of {_list(marked)} do not belong together: their lines of sight miss one"
+        f"The marks of {_named(marked)} do not belong together: their lines of sight miss one"
         " another by so much. Correct or remove these rows of the control points' file."
     ]
     return (*(notes if marked else ()), *_misplaced(seen), *_away(found, photos, priors))
@@ -78,7 +77,7 @@ def _misplaced(seen: Sequence[ControlResidual]) -> tuple[str, ...]:
         return ()
     return (
         f"The photos and the other control points do not agree with the coordinates of"
-        f" {_list(wrong)}. Correct coordinates, names or marks; such a point hardly counts beside"
+        f" {_named(wrong)}. Correct coordinates, names or marks; such a point hardly counts beside"
         " the others.",
     )
 
@@ -119,7 +118,6 @@ def _meets(point: ControlResidual) -> bool:
     return point.reprojection_px <= MISMARKED_PX and bool(np.isfinite(point.error_m[:2]).all())
 
 
-def _list(named: dict[str, str]) -> str:
+def _named(off: dict[str, str]) -> str:
     """`gcp1 (10 m), gcp2 (3 m) and 4 more`."""
-    said = ", ".join(f"{name} ({by})" for name, by in list(named.items())[:SHOWN])
-    return f"{said} and {len(named) - SHOWN} more" if len(named) > SHOWN else said
+    return sentence_of([f"{name} ({by})" for name, by in off.items()])

@@ -9,6 +9,7 @@ agree with heights and headings: both kinds are weighed by how likely they make 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,13 +131,23 @@ def _loose_ground(found: Alignment, held: Sequence[int]) -> float:
     return float(np.median(off[outer] / np.maximum(far[outer], 1e-6)))
 
 
+class Weighed(NamedTuple):
+    """What positions tell, weighed against something besides."""
+
+    change: float
+    """Of what positions tell."""
+    narrowed: float
+    """Deviation after the change over that stated."""
+    loose: float
+    """Deviation of what positions tell alone, as both kinds of receivers are likely."""
+
+
 def weighed(
     apart: float, loose: NDArray[np.float64], told: float, kinds: NDArray[np.float64]
-) -> tuple[float, float, float] | None:
-    """The change of what positions tell, with the deviations `loose` (2: as stated, and where their
-    errors last, of the log-likelihoods `kinds`), towards what lies `apart` and has the deviation
-    `told`, the share of the stated deviation that is left, and the deviation of what the positions
-    tell alone; None where they contradict each other.
+) -> Weighed | None:
+    """What positions tell, with the deviations `loose` (2: as stated, and where their errors last,
+    of the log-likelihoods `kinds`), weighed against what lies `apart` and has the deviation `told`;
+    None where they contradict each other.
     """
     whole = loose**2 + told**2
     if abs(apart) > CONTRADICTED * np.sqrt(whole[0]):
@@ -146,7 +157,11 @@ def weighed(
     share = loose**2 / whole
     change = apart * float(likely @ share)
     left = likely @ (share * told**2 + (apart * share - change) ** 2)
-    return change, float(np.sqrt(left) / loose[0]), float(np.sqrt(likely @ loose**2))
+    return Weighed(
+        change=change,
+        narrowed=float(np.sqrt(left) / loose[0]),
+        loose=float(np.sqrt(likely @ loose**2)),
+    )
 
 
 def _scale(
@@ -176,12 +191,13 @@ def _scale(
             " higher or lower, or the map is too large or small. Control points would tell."
         )
     return _Told(
-        f"{_known(found, held, 'scale', f'{min(100 * to[2], 100):.0f} %')}. So it rests on"
+        f"{_known(found, held, 'scale', f'{min(100 * to.loose, 100):.0f} %')}. So it rests on"
         " heights above take-off, too, which tell it where the ground is as high as the place of"
         " take-off. Control points would settle it."
-        if to[2] > LOOSE_SCALE
+        if to.loose > LOOSE_SCALE
         else "",
-        *to[:2],
+        to.change,
+        to.narrowed,
     )
 
 
@@ -201,11 +217,11 @@ def _heading(found: Alignment, priors: Sequence[Prior], held: Sequence[int]) -> 
     if to is None:
         return None  # told for each photo (`alignment.conflicts`)
     return _Told(
-        f"{_known(found, held, 'direction', f'{min(to[2], 180):.0f} degrees')}. So it rests on"
+        f"{_known(found, held, 'direction', f'{min(to.loose, 180):.0f} degrees')}. So it rests on"
         " their headings, too."
-        if to[2] > LOOSE_DEG
+        if to.loose > LOOSE_DEG
         else "",
-        float(np.radians(to[0])),
+        float(np.radians(to.change)),
     )
 
 
