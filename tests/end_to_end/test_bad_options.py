@@ -7,6 +7,7 @@ import sys
 
 import pytest
 import rasterio
+from pyproj import Transformer
 
 from tests.end_to_end.conftest import QUICK, keep, named, relabel, skyquilt
 
@@ -151,6 +152,18 @@ def test_bounds_outside_the_map(mosaic, flight):
         2, "--bounds 1,2,3,4", "outside the photos", "which cover 44"
     )
     assert "EPSG:32633" in told.err
+
+
+@pytest.mark.slow
+def test_a_boundary_narrower_than_a_pixel(mosaic, flight, finished, tmp_path):
+    """Else the map would be empty."""
+    with rasterio.open(finished / "mosaic.tif") as whole:
+        (x, y), crs = whole.xy(whole.height // 2, whole.width // 2), whole.crs
+    ring = Transformer.from_crs(crs, 4326, always_xy=True)
+    area = square(*ring.transform(x, y), *ring.transform(x + 0.003, y + 4.0))
+    (tmp_path / "area.geojson").write_text(area)
+    told = mosaic(flight / "photos", "--boundary", tmp_path / "area.geojson")
+    told.refused(6, "--boundary", "narrower than one pixel")
 
 
 @pytest.mark.slow

@@ -124,7 +124,7 @@ def find_ground(
     gsd = picture.gsd_cm / 100 if picture.gsd_cm else round_gsd(native)
     gsd = gsd if earlier is None else earlier.grid.gsd
     bounds = _local_bounds(picture, alignment)
-    _check_place(bounds, rough, picture, alignment)
+    _check_place(bounds, rough, picture, alignment, gsd)
     wide = grid_of(rough, gsd, bounds)
     _check_size(wide, native)
     area = _widened(wide.bounds, 0.05 * max(wide.width, wide.height) * gsd)
@@ -233,9 +233,17 @@ def _check_place(
     views: Sequence[View],
     picture: PictureSettings,
     alignment: Alignment,
+    gsd: float,
 ) -> None:
-    """Refuses an area that no photo covers."""
-    if bounds is None or any(v.overlaps(bounds) for v in views):
+    """Refuses an area that no photo covers, or that holds no pixel."""
+    if bounds is None:
+        return
+    if picture.bounds is None and min(bounds[2] - bounds[0], bounds[3] - bounds[1]) < gsd:
+        raise SideFileError(
+            f"the area of --boundary {picture.boundary} is narrower than one pixel of the map,"
+            f" {gsd * 100:.2g} cm"
+        )
+    if any(v.overlaps(bounds) for v in views):
         return
     outline = np.concatenate([v.footprint for v in views]) + alignment.frame.origin
     (west, south), (east, north) = outline.min(0), outline.max(0)
