@@ -45,11 +45,17 @@ def control_notes(
             " are counted from the upper left corner of the photo as it is stored, to the right"
             " and down; correct that file.",
         )
-    notes = [
+    return (*_mismarked(marked), *_misplaced(seen), *_away(found, photos, priors))
+
+
+def _mismarked(marked: dict[str, str]) -> tuple[str, ...]:
+    """A sentence on points of wrong marks, by name and by how much their lines of sight miss."""
+    if not marked:
+        return ()
+    return (
         f"The marks of {_named(marked)} do not belong together: their lines of sight miss one"
-        " another by so much. Correct or remove these rows of the control points' file."
-    ]
-    return (*(notes if marked else ()), *_misplaced(seen), *_away(found, photos, priors))
+        " another by so much. Correct or remove these rows of the control points' file.",
+    )
 
 
 def _misplaced(seen: Sequence[ControlResidual]) -> tuple[str, ...]:

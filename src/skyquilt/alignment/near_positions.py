@@ -153,7 +153,8 @@ def weighed(
     if abs(apart) > CONTRADICTED * np.sqrt(whole[0]):
         return None
     likely = kinds - apart**2 / (2 * whole) - np.log(whole) / 2
-    likely = np.exp(likely - likely.max()) / np.exp(likely - likely.max()).sum()
+    likely = np.exp(likely - likely.max())
+    likely /= likely.sum()
     share = loose**2 / whole
     change = apart * float(likely @ share)
     left = likely @ (share * told**2 + (apart * share - change) ** 2)

@@ -102,8 +102,8 @@ class FormerRaster:
         return pixels, shown
 
     def tile(self, row: int, column: int, spec: RasterSpec) -> tuple[bytes, bytes] | None:
-        """Bytes of image and mask of a tile as `spec` would have it; None where it is empty, or the
-        file is written otherwise.
+        """Bytes of image and mask of a tile as `spec` would have it; None where the file has none,
+        or is written otherwise.
         """
         page = self._page
         if (page.tilewidth, page.tilelength) != (spec.tile, spec.tile):
