@@ -69,6 +69,45 @@ def test_signs_that_some_positions_lost_are_given_back(make_jpeg, kind, words, d
     assert note.startswith("3 photos (006.jpg") and f"once {words} are exchanged" in note
 
 
+def survey_at_heights(make_jpeg, heights):
+    """The survey of photos with these heights above sea level in m."""
+    for i, height in enumerate(heights):
+        exif = dji_exif()
+        exif["GPS"] = gps_exif(46.6 + i * 0.000123, 14.3, height)
+        folder = make_jpeg(f"{i:03d}.jpg", exif=exif, seed=i).parent
+    return read_survey(folder)
+
+
+@pytest.mark.parametrize(
+    ("low", "wrong", "sign"),
+    [(20, 5, 1), (300, 4, 1), (460, 7, 1), (-420, 3, -1), (-80, 4, -1), (90, 1, 1)],
+)
+def test_heights_of_the_other_sign_are_turned_round(make_jpeg, low, wrong, sign):
+    """Ten photos of which some have lost EXIF's `GPSAltitudeRef`, or got it. Below 430 m under the
+    sea there is no land, so that most may be wrong.
+    """
+    true = [low + 1.5 * i for i in range(10)]
+    survey = survey_at_heights(make_jpeg, [-h if i < wrong else h for i, h in enumerate(true)])
+    for photo, height in zip(survey.photos, true, strict=True):
+        assert photo.position.altitude_m == photo.position.sea_level_m == pytest.approx(height)
+    (note,) = [n for n in survey.notes if "sign" in n]
+    assert note.startswith(f"In {wrong} of 10 photos (000.jpg") and "geo.txt" in note
+
+
+@pytest.mark.parametrize(
+    "heights",
+    [
+        [-6, -3, 4, 7, 9],  # over a polder, by a poor receiver
+        [60, 31, 4, -27, -54],  # a drift
+        [120, 400, 700, -30, 120],
+    ],
+)
+def test_heights_on_both_sides_of_the_sea_level_stay(make_jpeg, heights):
+    survey = survey_at_heights(make_jpeg, heights)
+    assert [p.position.altitude_m for p in survey.photos] == pytest.approx(heights)
+    assert not any("sign" in n for n in survey.notes)
+
+
 def test_an_old_position_that_is_repeated_is_no_site(make_jpeg):
     for i in range(9):
         folder = photo_at(make_jpeg, i, 47.9 if i < 3 else 46.6 + i * 0.000123, 14.3)

@@ -1,5 +1,5 @@
-"""Positions that are wrong or say less than they seem: far from the others, all in one place, a
-whole flight at height zero, rounded, or repeated.
+"""Positions that are wrong or say less than they seem: far from the others, heights of the other
+sign, all in one place, a whole flight at height zero, rounded, or repeated.
 
 Wrong ones are not used. Rounded and repeated ones get deviations as large as they are, so that they
 do not shrink or turn a map.
@@ -23,6 +23,8 @@ NEAR = 0.01
 """Positions whose signs or coordinates are exchanged must come nearer to the others than this share
 of their distance.
 """
+_RECEIVER_M = 20.0
+"""Errors of heights by which a receiver may put some photos above zero and others below it."""
 _EXCHANGED: dict[str, Callable[[float, float], tuple[float, float]]] = {
     "north and south": lambda north, east: (-north, east),
     "east and west": lambda north, east: (north, -east),
@@ -31,6 +33,8 @@ _EXCHANGED: dict[str, Callable[[float, float], tuple[float, float]]] = {
 }
 _EARTH_M = _METRES_PER_DEGREE * 180 / np.pi
 _GROUND_M = 2.0
+_LOWEST_LAND_M = -430.0
+"""Height above sea level of the shore of the Dead Sea, below which no drone flies."""
 _STUCK_M = 0.05
 _STUCK_PHOTOS = 4
 _SITE_PHOTOS = 3
@@ -95,6 +99,53 @@ def _with_other_signs(
                 " positions in a geo.txt."
             )
     return [], ""
+
+
+def with_one_sign(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
+    """The photos, with the sign of the others where some heights lie as far below zero as the
+    others lie above it, and a note on these: a program lost or made up EXIF's `GPSAltitudeRef`.
+
+    Of both signs the one of most photos is right, of equally many the positive one, which is also
+    that of heights at which there is no land.
+    """
+    kept, notes = list(photos), list[str]()
+    for name, zero in (("sea_level_m", "sea level"), ("ellipsoid_m", "the ellipsoid")):
+        found = {i: getattr(p.position, name) for i, p in enumerate(photos) if p.position}
+        heights = {i: float(h) for i, h in found.items() if h}
+        above, below = ([i for i, h in heights.items() if (h > 0) == up] for up in (True, False))
+        if not above or not below or not _same_but_for_sign([*heights.values()]):
+            continue
+        deep = min(heights.values()) < _LOWEST_LAND_M
+        wrong = below if deep or len(below) <= len(above) else above
+        for i in wrong:
+            kept[i] = _with_height(kept[i], name, -heights[i])
+        right = above if wrong is below else below
+        notes.append(
+            f"In {len(wrong)} of {len(heights)} photos ({sentence_of([photos[i].name for i in wrong])})"
+            f" the height above {zero} is {np.median([heights[i] for i in wrong]):.0f} m, in the"
+            f" others {np.median([heights[i] for i in right]):.0f} m: the sign of the"
+            f" {len(wrong)} was taken for wrong and changed. If it is that of the others, give"
+            " heights in a geo.txt."
+        )
+    return tuple(kept), tuple(notes)
+
+
+def _same_but_for_sign(heights: Sequence[float]) -> bool:
+    """Whether heights of both signs in m are alike once all are positive: these differ by less
+    than those of both signs lie apart, and no receiver's error explains that gap.
+    """
+    size = np.abs(heights)
+    return bool(2 * size.min() > max(np.ptp(size), _RECEIVER_M))
+
+
+def _with_height(photo: Photo, name: str, height_m: float) -> Photo:
+    """The photo with another height above sea level or the ellipsoid (a field of its position)."""
+    old = photo.position
+    if old is None:
+        return photo
+    used = old.altitude_m == getattr(old, name) and old.datum == name.removesuffix("_m")
+    changed = {name: height_m} | ({"altitude_m": height_m} if used else {})
+    return replace(photo, position=replace(old, **changed))
 
 
 def _told(members: Sequence[Photo], far: NDArray[np.float64], main: int) -> list[str]:

@@ -23,6 +23,7 @@ from skyquilt.photos.found_files import (
 )
 from skyquilt.photos.implausible_positions import (
     with_coarse_deviations,
+    with_one_sign,
     without_ground_heights,
     without_outliers,
     without_stuck,
@@ -227,8 +228,9 @@ def placed_plausibly(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[
     ordered, grounded = without_ground_heights(sorted(photos, key=capture_order))
     ordered, stuck = without_stuck(ordered)
     ordered, far = without_outliers(ordered)
+    ordered, signs = with_one_sign(ordered)
     ordered, coarse = with_coarse_deviations(ordered)
-    return ordered, (*grounded, *stuck, *far, *coarse)
+    return ordered, (*grounded, *stuck, *far, *signs, *coarse)
 
 
 def _with_editors(photos: Sequence[Photo]) -> tuple[Photo, ...]:
