@@ -3,6 +3,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import simplejpeg
 import tifffile
 from PIL import Image
 
@@ -81,6 +82,60 @@ def test_damage_inside_raises_instead_of_yielding_grey(make_jpeg):
     path.write_bytes(data[:middle] + bytes(3000) + data[middle + 3000 :])
     with pytest.raises(UnreadablePhotoError, match="damaged"):
         read_color(photo)
+
+
+def test_a_wrong_bit_that_moves_all_pixels_after_it_is_damage(make_jpeg):
+    """The decoder then has bytes left over, as it has of what some cameras fill up with; where it
+    has none, nobody can tell.
+    """
+    path = make_jpeg(image=np.random.default_rng(1).integers(90, 110, (64, 96, 3), np.uint8))
+    good, original = read_photo(path), path.read_bytes()
+    rng, told = np.random.default_rng(1), 0
+    for place in rng.integers(len(original) // 2, len(original) * 9 // 10, 60):
+        wrong = bytearray(original)
+        wrong[place] ^= 1 << int(rng.integers(8))
+        try:
+            decoded = simplejpeg.decode_jpeg(bytes(wrong), strict=True) is not None
+        except ValueError as error:
+            decoded = "extraneous" not in str(error)
+        path.write_bytes(wrong)
+        if not decoded:
+            told += 1
+            with pytest.raises(UnreadablePhotoError, match="damaged"):
+                read_color(good)
+    assert told > 3
+    for filling in (b"\0" * 50, b"\x20" * 7, b"\1\2\3"):
+        path.write_bytes(original[:-2] + filling + original[-2:])
+        assert np.array_equal(read_color(good), decode_jpeg(original))
+
+
+@pytest.mark.parametrize("below", [False, True])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+def test_a_small_first_page_of_a_tiff_is_a_preview_although_it_does_not_say_so(
+    tmp_path, below, dtype
+):
+    large = pixels(384, 256).astype(dtype)
+    small = np.ascontiguousarray(large[::4, ::4])
+    path = tmp_path / "a.tif"
+    with tifffile.TiffWriter(path) as tiff:
+        tiff.write(small, photometric="rgb", subifds=1 if below else None)
+        tiff.write(large, photometric="rgb")
+    photo = read_photo(path)
+    assert (photo.width, photo.height) == large.shape[1::-1]
+    assert any("preview" in n for n in photo.notes)
+    assert np.array_equal(read_color(photo), large)
+
+
+@pytest.mark.parametrize("other", [(128, 128, 3), (128, 192)])
+def test_another_picture_behind_the_first_page_of_a_tiff_is_not_the_photo(tmp_path, other):
+    """Of another shape, or of one band: what a thermal camera saves beside its picture."""
+    path = tmp_path / "a.tif"
+    with tifffile.TiffWriter(path) as tiff:
+        tiff.write(pixels(96, 64), photometric="rgb")
+        kind = "rgb" if len(other) == 3 else "minisblack"
+        tiff.write(np.zeros(other, np.uint8), photometric=kind)
+    photo = read_photo(path)
+    assert np.array_equal(read_color(photo), pixels(96, 64))
 
 
 def test_a_file_that_changed_its_size_is_no_longer_that_photo(make_jpeg):

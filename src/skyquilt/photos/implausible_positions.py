@@ -120,10 +120,11 @@ def with_one_sign(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str
         for i in wrong:
             kept[i] = _with_height(kept[i], name, -heights[i])
         right = above if wrong is below else below
+        names = sentence_of([photos[i].name for i in wrong])
         notes.append(
-            f"In {len(wrong)} of {len(heights)} photos ({sentence_of([photos[i].name for i in wrong])})"
-            f" the height above {zero} is {np.median([heights[i] for i in wrong]):.0f} m, in the"
-            f" others {np.median([heights[i] for i in right]):.0f} m: the sign of the"
+            f"In {len(wrong)} of {len(heights)} photos ({names}) the height above {zero} is"
+            f" {np.median([heights[i] for i in wrong]):.0f} m, in the others"
+            f" {np.median([heights[i] for i in right]):.0f} m: the sign of the"
             f" {len(wrong)} was taken for wrong and changed. If it is that of the others, give"
             " heights in a geo.txt."
         )

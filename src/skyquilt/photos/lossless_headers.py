@@ -39,6 +39,8 @@ _MOST_PAGES = 8
 """Pages of a TIFF that are looked at."""
 _SAME_SHAPE = 0.03
 """Relative difference of the ratios of their sides up to which two pages show the same."""
+_LARGER = 1.5
+"""A page so many times as wide as the first one, of its shape and bands, has that as a preview."""
 _REDUCED, _MASK = 1, 4
 """Bits of a page's subtype."""
 
@@ -131,8 +133,8 @@ def measured_page(tiff: tifffile.TiffFile) -> tuple[tifffile.TiffPage, int]:
     """The page of a TIFF that is the photo, and the number of its full-size pages.
 
     That is the first one, unless it is a preview: a page says that it is a reduced one and another
-    is not (the largest of those), or it has 8 bits and a later one, of the same shape, measurements
-    of 16 bits or more in one band.
+    is not (the largest of those); it has 8 bits and a later one, of the same shape, measurements
+    of 16 bits or more in one band; or, whether it says so or not, a later one is the same larger.
     """
     first = tiff.pages.first
     if len(tiff.pages) == 1 and first.subifds is None:
@@ -141,14 +143,22 @@ def measured_page(tiff: tifffile.TiffFile) -> tuple[tifffile.TiffPage, int]:
     full = [p for p in pages if not int(p.subfiletype) & (_REDUCED | _MASK)]
     if int(first.subfiletype) & _REDUCED and full:
         first = max(full, key=lambda p: p.imagewidth * p.imagelength)
+    alike = [p for p in full if _same_shape(p, first)]
     if first.dtype is not None and first.dtype.itemsize == 1:
-        shape = first.imagewidth / max(first.imagelength, 1)
-        for page in full:
-            deep = page.dtype is not None and page.dtype.itemsize > 1 and page.samplesperpixel == 1
-            alike = abs(page.imagewidth / max(page.imagelength, 1) / shape - 1) < _SAME_SHAPE
-            if deep and alike:
-                return page, len(full)
+        deep = (p for p in alike if p.dtype is not None and p.dtype.itemsize > 1)
+        measured = next((p for p in deep if p.samplesperpixel == 1), None)
+        if measured is not None:
+            return measured, len(full)
+    bands = [p for p in alike if p.samplesperpixel == first.samplesperpixel]
+    larger = [p for p in bands if p.imagewidth > _LARGER * first.imagewidth]
+    first = max(larger, key=lambda p: p.imagewidth, default=first)
     return first, len(full)
+
+
+def _same_shape(a: tifffile.TiffPage, b: tifffile.TiffPage) -> bool:
+    """Whether the sides of two pages have the same ratio."""
+    shape = b.imagewidth / max(b.imagelength, 1)
+    return bool(abs(a.imagewidth / max(a.imagelength, 1) / shape - 1) < _SAME_SHAPE)
 
 
 def _pages(tiff: tifffile.TiffFile) -> list[tifffile.TiffPage]:

@@ -36,9 +36,10 @@ _XMP = 700
 """Tag of a TIFF with its XMP packet."""
 _NODATA = 42113
 """GDAL's tag of a TIFF: the value of pixels that have none, as text."""
-_HARMLESS = re.compile(
-    r"\b\d{1,2} extraneous bytes before marker|JFIF|Inconsistent progression|Invalid SOS"
-)
+_HARMLESS = re.compile(r"JFIF|Inconsistent progression|Invalid SOS")
+_LEFT_OVER = re.compile(r"\b(\d{1,2}) extraneous bytes before marker 0x([0-9a-f]{2})")
+_FEW_BYTES = 4
+"""So many bytes that no pixel needs mean nothing, whatever they are."""
 
 
 def read_color(photo: Photo, *, reduction: Reduction = 1) -> Pixels:
@@ -179,10 +180,23 @@ def decode_jpeg(data: bytes, *, gray: bool = False, reduction: Reduction = 1) ->
     try:
         pixels = simplejpeg.decode_jpeg(data, **wanted)
     except ValueError as error:
-        if not _HARMLESS.search(str(error)):
+        if not _is_harmless(str(error), data):
             raise UnreadablePhotoError(f"its JPEG data are damaged ({error})") from error
         pixels = simplejpeg.decode_jpeg(data, strict=False, **wanted)
     return np.asarray(pixels[..., 0] if gray else pixels, dtype=np.uint8)
+
+
+def _is_harmless(complaint: str, data: bytes) -> bool:
+    """Whether all pixels are there in spite of what the decoder complains of. Bytes that it did not
+    need are what a camera fills up with where they are few or all alike; others are pixels, which a
+    wrong bit before has moved out of their places.
+    """
+    left = _LEFT_OVER.search(complaint)
+    if left is None:
+        return _HARMLESS.search(complaint) is not None
+    number, marker = int(left[1]), re.escape(b"\xff" + bytes.fromhex(left[2]))
+    alike = rb"(.)\1{%d}" % (number - 1) + marker
+    return number <= _FEW_BYTES or re.search(alike, data, re.DOTALL) is not None
 
 
 def _thermal_jpeg(path: Path) -> Pixels:
