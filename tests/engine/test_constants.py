@@ -64,7 +64,7 @@ IN_NO_KEY = {
         "the numbers that the formats TIFF and PNG give to tags",
     ),
     **dict.fromkeys(
-        ("_MOST_PAGES", "_SAME_SHAPE", "_REDUCED", "_MASK"),
+        ("_MOST_PAGES", "_SAME_SHAPE", "_LARGER", "_REDUCED", "_MASK"),
         "which page of a TIFF is the photo changes with the version only, which is in the keys",
     ),
     **dict.fromkeys(

@@ -94,9 +94,24 @@ def test_heights_of_the_other_sign_are_turned_round(make_jpeg, low, wrong, sign)
     assert note.startswith(f"In {wrong} of 10 photos (000.jpg") and "geo.txt" in note
 
 
+@pytest.mark.parametrize("unknown", [(3,), (0, 2, 4), range(1, 9)])
+@pytest.mark.parametrize("height", [500.0, 61.0, -55.0])
+def test_a_height_of_zero_among_others_is_none(make_jpeg, unknown, height):
+    true = [height + i for i in range(9)]
+    survey = survey_at_heights(make_jpeg, [0 if i in unknown else h for i, h in enumerate(true)])
+    for i, photo in enumerate(survey.photos):
+        want = None if i in unknown else pytest.approx(true[i])
+        assert photo.position.altitude_m == photo.position.sea_level_m == want
+        assert photo.position.datum == ("unknown" if i in unknown else "sea_level")
+    (note,) = [n for n in survey.notes if "exactly 0" in n]
+    assert note.startswith(f"In {len(unknown)} of 9 photos (")
+
+
 @pytest.mark.parametrize(
     "heights",
     [
+        [0, 0, 0, 0],
+        [-2, 0, 3, 6, 9],  # at the sea
         [-6, -3, 4, 7, 9],  # over a polder, by a poor receiver
         [60, 31, 4, -27, -54],  # a drift
         [120, 400, 700, -30, 120],
@@ -105,7 +120,7 @@ def test_heights_of_the_other_sign_are_turned_round(make_jpeg, low, wrong, sign)
 def test_heights_on_both_sides_of_the_sea_level_stay(make_jpeg, heights):
     survey = survey_at_heights(make_jpeg, heights)
     assert [p.position.altitude_m for p in survey.photos] == pytest.approx(heights)
-    assert not any("sign" in n for n in survey.notes)
+    assert not any("sign" in n or "exactly" in n for n in survey.notes)
 
 
 def test_an_old_position_that_is_repeated_is_no_site(make_jpeg):

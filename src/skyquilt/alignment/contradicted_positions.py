@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.enlarged import heights_above_ground
+from skyquilt.alignment.false_heights import height_warnings
 from skyquilt.alignment.similarity_graph import fit_similarity
 from skyquilt.alignment.start import ground_of
 from skyquilt.model.poses import Alignment, Prior
@@ -48,7 +49,7 @@ focal length alone makes such factors.
 
 def contradictions(priors: Sequence[Prior], alignment: Alignment) -> list[str]:
     """All sentences of this module."""
-    asked = (position_warnings, loose_warnings, enlargement_warnings)
+    asked = (position_warnings, height_warnings, loose_warnings, enlargement_warnings)
     return [sentence for warnings in asked for sentence in warnings(priors, alignment)]
 
 

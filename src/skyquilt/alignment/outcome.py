@@ -83,7 +83,9 @@ def leave_one_out(
         out.append(full)
     if not out:
         return None
-    rms = np.sqrt(np.nanmean(np.array(out) ** 2, axis=0))
+    squares = np.array(out) ** 2
+    count = np.isfinite(squares).sum(0)  # perhaps of no height
+    rms = np.sqrt(np.where(count, np.nansum(squares, 0), np.nan) / np.maximum(count, 1))
     return float(rms[0]), float(rms[1]), float(rms[2])
 
 

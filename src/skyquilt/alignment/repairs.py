@@ -11,6 +11,7 @@ from typing import Any
 from skyquilt.alignment.determined import STATED_DEG
 from skyquilt.alignment.displaced_parts import brought_together, outvoted, placed_between
 from skyquilt.alignment.enlarged import enlarged_note, enlarged_photos, fits_better
+from skyquilt.alignment.false_heights import outvoted_heights
 from skyquilt.alignment.false_tilts import common_tilts, leaning_lines, off_told, told_no_tilt
 from skyquilt.alignment.late_positions import mirrored, moved_note, on_time, unshifted
 from skyquilt.alignment.oblique import reported_oblique, tilted, turned_deg, without_photos
@@ -276,6 +277,17 @@ def _outvoted_positions(last: Tried, survey: Survey) -> Tried:
     return _if_nearer(last, survey, majority.priors, "outvoted ", majority.note)
 
 
+def _outvoted_heights(last: Tried, survey: Survey) -> Tried:
+    """Heights that contradict those of most photos are not used."""
+    majority = outvoted_heights(last.found, survey.names, last.begun.priors)
+    if majority is None:
+        return last
+    other = survey.tried(last.begun, priors=majority.priors, name="heights ")
+    if not fits_as_well(other.found, last.found):
+        return last
+    return replace(other, notes=(*last.notes, majority.note))
+
+
 def _common_tilts(last: Tried, survey: Survey) -> Tried:
     """Tilts with an error that all photos of a camera have in common are corrected by it. False
     heights look like such an error, too, but then pictures contradict it.
@@ -408,6 +420,7 @@ REPAIRS: tuple[Callable[[Tried, Survey], Tried], ...] = (
     _leaning_lines,
     _late_moments,
     _outvoted_positions,
+    _outvoted_heights,
     _common_tilts,
     _false_tilts,
     _guessed_directions,

@@ -1,5 +1,5 @@
 """Positions that are wrong or say less than they seem: far from the others, heights of the other
-sign, all in one place, a whole flight at height zero, rounded, or repeated.
+sign or of zero, all in one place, a whole flight at height zero, rounded, or repeated.
 
 Wrong ones are not used. Rounded and repeated ones get deviations as large as they are, so that they
 do not shrink or turn a map.
@@ -7,6 +7,7 @@ do not shrink or turn a map.
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,12 @@ _EXCHANGED: dict[str, Callable[[float, float], tuple[float, float]]] = {
     "latitude and longitude": lambda north, east: (east, north),
 }
 _EARTH_M = _METRES_PER_DEGREE * 180 / np.pi
+_Name = Literal["sea_level_m", "ellipsoid_m"]
+_ZEROS: tuple[tuple[_Name, str], ...] = (
+    ("sea_level_m", "sea level"),
+    ("ellipsoid_m", "the ellipsoid"),
+)
+"""Heights of a position that have a sign, and from where they count."""
 _GROUND_M = 2.0
 _LOWEST_LAND_M = -430.0
 """Height above sea level of the shore of the Dead Sea, below which no drone flies."""
@@ -101,6 +108,27 @@ def _with_other_signs(
     return [], ""
 
 
+def without_zero_heights(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
+    """The photos, without heights of exactly zero where others lie far from it, and a note on
+    these: receivers write zero until they know a height.
+    """
+    kept, notes = list(photos), list[str]()
+    for name, zero in _ZEROS:
+        told = {i: getattr(p.position, name) for i, p in enumerate(photos) if p.position}
+        unknown = [i for i, height in told.items() if height == 0]
+        known = [abs(height) for height in told.values() if height]
+        if not unknown or not known or min(known) < _RECEIVER_M:
+            continue
+        for i in unknown:
+            kept[i] = _with_height(kept[i], name, None)
+        names = sentence_of([photos[i].name for i in unknown])
+        notes.append(
+            f"In {len(unknown)} of {len(photos)} photos ({names}) the height above {zero} is"
+            " exactly 0, as receivers write it until they know one; it was not used."
+        )
+    return tuple(kept), tuple(notes)
+
+
 def with_one_sign(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
     """The photos, with the sign of the others where some heights lie as far below zero as the
     others lie above it, and a note on these: a program lost or made up EXIF's `GPSAltitudeRef`.
@@ -109,7 +137,7 @@ def with_one_sign(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str
     that of heights at which there is no land.
     """
     kept, notes = list(photos), list[str]()
-    for name, zero in (("sea_level_m", "sea level"), ("ellipsoid_m", "the ellipsoid")):
+    for name, zero in _ZEROS:
         found = {i: getattr(p.position, name) for i, p in enumerate(photos) if p.position}
         heights = {i: float(h) for i, h in found.items() if h}
         above, below = ([i for i, h in heights.items() if (h > 0) == up] for up in (True, False))
@@ -139,14 +167,21 @@ def _same_but_for_sign(heights: Sequence[float]) -> bool:
     return bool(2 * size.min() > max(np.ptp(size), _RECEIVER_M))
 
 
-def _with_height(photo: Photo, name: str, height_m: float) -> Photo:
+def _with_height(photo: Photo, name: _Name, height_m: float | None) -> Photo:
     """The photo with another height above sea level or the ellipsoid (a field of its position)."""
     old = photo.position
     if old is None:
         return photo
     used = old.altitude_m == getattr(old, name) and old.datum == name.removesuffix("_m")
-    changed = {name: height_m} | ({"altitude_m": height_m} if used else {})
-    return replace(photo, position=replace(old, **changed))
+    position = (
+        replace(old, sea_level_m=height_m)
+        if name == "sea_level_m"
+        else replace(old, ellipsoid_m=height_m)
+    )
+    if used:
+        datum: Datum = "unknown" if height_m is None else old.datum
+        position = replace(position, altitude_m=height_m, datum=datum)
+    return replace(photo, position=position)
 
 
 def _told(members: Sequence[Photo], far: NDArray[np.float64], main: int) -> list[str]:

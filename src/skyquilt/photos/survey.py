@@ -27,6 +27,7 @@ from skyquilt.photos.implausible_positions import (
     without_ground_heights,
     without_outliers,
     without_stuck,
+    without_zero_heights,
 )
 from skyquilt.photos.left_out import (
     band_note,
@@ -228,9 +229,10 @@ def placed_plausibly(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[
     ordered, grounded = without_ground_heights(sorted(photos, key=capture_order))
     ordered, stuck = without_stuck(ordered)
     ordered, far = without_outliers(ordered)
+    ordered, zero = without_zero_heights(ordered)
     ordered, signs = with_one_sign(ordered)
     ordered, coarse = with_coarse_deviations(ordered)
-    return ordered, (*grounded, *stuck, *far, *signs, *coarse)
+    return ordered, (*grounded, *stuck, *far, *zero, *signs, *coarse)
 
 
 def _with_editors(photos: Sequence[Photo]) -> tuple[Photo, ...]:

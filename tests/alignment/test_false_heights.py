@@ -1,0 +1,77 @@
+"""Heights that contradict those of most photos are not used, and others are left alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from skyquilt.alignment.false_heights import height_warnings, outvoted_heights
+from tests.alignment.test_displaced_parts import lines, survey
+
+SIGMA_M = 3.0
+
+
+def told_at(heights, sigma=SIGMA_M, lifted_m=0.0):
+    """An alignment of photos 60 m high, lifted by what false heights do, the photos' names, and
+    priors with these heights.
+    """
+    true = lines(len(heights))
+    told = np.column_stack([true[:, :2], heights])
+    found, names, priors, _ = survey(true + (0, 0, lifted_m), told, SIGMA_M)
+    stated = np.broadcast_to(sigma, len(true))
+    priors = [replace(p, sigma_C=np.full(3, s)) for p, s in zip(priors, stated, strict=True)]
+    return found, names, priors
+
+
+def noisy(count, sigma=SIGMA_M, seed=0):
+    return 60 + np.random.default_rng(seed).normal(0, sigma, count)
+
+
+@pytest.mark.parametrize("false", [1, 5, 7])
+@pytest.mark.parametrize("by_m", [-440.0, 35.0, 1000.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_heights_that_most_others_contradict_are_not_used(false, by_m, seed):
+    heights = noisy(20, seed=seed)
+    wrong = np.random.default_rng(seed).permutation(20)[:false]
+    heights[wrong] += by_m
+    found, names, priors = told_at(heights, lifted_m=by_m * false / 20 + 5)
+    told = outvoted_heights(found, names, priors)
+    assert {i for i, p in enumerate(told.priors) if np.isnan(p.map_C[2])} == set(wrong)
+    assert all(
+        np.array_equal(a.map_C[:2], b.map_C[:2]) for a, b in zip(told.priors, priors, strict=True)
+    )
+    assert told.note.startswith(f"The heights of {false} of 20 photos lie")
+    assert f"{wrong.min():03d}.jpg" in told.note
+
+
+@pytest.mark.parametrize("sigma", [0.03, 3.0, 15.0])
+def test_heights_with_errors_of_receivers_and_barometers_are_used(sigma):
+    noise = noisy(20, sigma)
+    drift = np.linspace(0, 60, 20) - 30
+    flights = np.repeat([0.0, 12.0], 10)
+    for heights in (noise, noise + drift, noise + flights):
+        case = told_at(heights, sigma, 20.0)
+        assert outvoted_heights(*case) is None
+        assert height_warnings(case[2], case[0]) == [] or sigma < 3
+
+
+def test_heights_by_which_the_map_lies_already_are_left_alone():
+    heights = noisy(20)
+    heights[3] += 500
+    assert outvoted_heights(*told_at(heights)) is None
+
+
+def test_those_that_know_less_may_differ_more():
+    """Photos that lost their correction."""
+    sigma = np.where(np.arange(20) % 5, 0.03, 15.0)
+    heights = 60 + np.where(np.arange(20) % 5, 0.02, 30.0)
+    assert outvoted_heights(*told_at(heights, sigma, 6.0)) is None
+
+
+@pytest.mark.parametrize("by_m", [-440.0, 60.0])
+def test_half_of_the_heights_against_the_other_half_are_told(by_m):
+    heights = noisy(20) + np.where(np.arange(20) % 2, by_m, 0)
+    found, names, priors = told_at(heights, lifted_m=by_m / 2)
+    assert outvoted_heights(found, names, priors) is None
+    (note,) = height_warnings(priors, found)
+    assert note.startswith("The reported heights contradict the pictures")
