@@ -3,6 +3,7 @@ again.
 """
 
 import errno
+import io
 import json
 import os
 import shutil
@@ -181,8 +182,10 @@ def test_a_full_disk(mosaic, flight, small_disk, finished, size):
 def test_a_disk_that_fills_up_while_intermediate_results_are_stored(
     mosaic, flight, finished, monkeypatch, stage
 ):
-    def full(file, value):
-        data = codec.encode(value)
+    def full(file, value, name):
+        buffer = io.BytesIO()
+        codec.write(buffer, value, name)
+        data = buffer.getvalue()
         if Path(file.name).parent.name == stage:
             file.write(data[: len(data) // 2])
             raise OSError(errno.ENOSPC, "No space left on device")

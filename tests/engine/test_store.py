@@ -43,6 +43,19 @@ def test_a_torn_artefact_is_made_again(store, size):
     assert store.get("stage", "key") == [7]
 
 
+@pytest.mark.parametrize("other", ["stage/b", "another/a"])
+def test_an_artefact_in_the_place_of_another_is_made_again(store, other):
+    """Files that a program or a person exchanged are whole, and of the same kind."""
+    stage, key = other.split("/")
+    store.put("stage", "a", 1.0)
+    store.put(stage, key, 2.0)
+    theirs = (store.folder / stage / f"{key}.npz").read_bytes()
+    (store.folder / "stage" / "a.npz").write_bytes(theirs)
+    assert store.get("stage", "a") is None
+    assert store.get_or("stage", "a", lambda: 1.0) == 1.0
+    assert (store.get("stage", "a"), store.get(stage, key)) == (1.0, 2.0)
+
+
 def test_what_is_there_is_told_without_reading_it(store):
     assert not store.has("stage", "key")
     store.put("stage", "key", [1])
@@ -61,7 +74,7 @@ def test_values_that_count_as_nothing_are_kept(store):
 def test_a_full_disk_leaves_the_former_artefact(store, monkeypatch):
     store.put("stage", "key", [1])
 
-    def full(file, value):
+    def full(file, value, name):
         file.write(b"PK")
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -134,11 +147,11 @@ def test_two_processes_may_make_the_same_result(store, monkeypatch):
     """The other one finishes while this one writes."""
     other = Store(folder=store.folder, registry={})
 
-    def meanwhile(file, value):
+    def meanwhile(file, value, name):
         monkeypatch.undo()
         monkeypatch.setattr("os.getpid", lambda: 77)
         other.put("stage", "key", [1])
-        codec.write(file, value)
+        codec.write(file, value, name)
 
     monkeypatch.setattr("skyquilt.engine.store.write", meanwhile)
     store.put("stage", "key", [1])

@@ -5,7 +5,7 @@ from datetime import datetime
 
 import pyproj
 import pytest
-from pyproj import Geod
+from pyproj import Geod, Transformer
 
 from skyquilt.alignment.setup import intrinsic_priors
 from skyquilt.errors import SideFileError
@@ -480,6 +480,43 @@ def test_positions_that_a_mistake_of_the_file_explains_are_refused(
     photo = read_photo(make_jpeg("DJI_0001.JPG", exif=dji_exif(GPS=gps_exif(*there))))
     with pytest.raises(SideFileError, match=words):
         apply_positions([photo], written(tmp_path, f"EPSG:4326\nDJI_0001 {lon} {lat}\n"))
+
+
+@pytest.mark.parametrize(
+    ("system", "x", "y", "words"),
+    [
+        (32615, "y", "x", r"x and y \(easting and northing\) are exchanged"),
+        (32715, "x", "y", r"the other hemisphere \(EPSG:32615 is right\)"),
+        (26915, "y", "x", "are exchanged"),
+    ],
+)
+@pytest.mark.parametrize("table", [False, True])
+def test_mistakes_with_eastings_and_northings_are_refused(
+    tmp_path, photo, system, x, y, words, table
+):
+    to_map = Transformer.from_crs(4326, 32615, always_xy=True)
+    place = dict(zip("xy", to_map.transform(HERE[1], HERE[0]), strict=True))
+    head = f"EPSG:{system}\n" + "name,x,y\n" * table
+    row = f"DJI_0001,{place[x]},{place[y]}\n"
+    side = written(tmp_path, head + (row if table else row.replace(",", " ")), "a.csv")
+    with pytest.raises(SideFileError, match=words):
+        apply_positions([photo], side)
+
+
+def test_a_mistake_in_half_of_the_rows_is_one_of_the_file(tmp_path, make_jpeg):
+    """In fewer, positions that are exchanged are turned round (`implausible_positions`)."""
+    there = dji_exif(GPS=gps_exif(46.5, 14.3))
+    photos = [read_photo(make_jpeg(f"{i}.jpg", exif=there, seed=i)) for i in range(6)]
+
+    def side(wrong):
+        places = ["46.5 14.3" if i < wrong else "14.3 46.5" for i in range(6)]
+        rows = (f"{i}.jpg {place}\n" for i, place in enumerate(places))
+        return written(tmp_path, "EPSG:4326\n" + "".join(rows))
+
+    with pytest.raises(SideFileError, match=r"3 of 6 photos .* are exchanged"):
+        apply_positions(photos, side(3))
+    (_, notes) = apply_positions(photos, side(2))
+    assert not any("km from" in n for n in notes)
 
 
 @pytest.mark.parametrize(("east", "south"), [(0.02, 1), (0, -1)])

@@ -190,6 +190,7 @@ def test_one_sentence_for_each_terrain_that_cannot_be_used(tmp_path):
         ({"height_m": float("nan")}, "--height must be"),
         ({"height_m": 50, "overlap": 100}, "--overlap must be"),
         ({"height_m": 50, "views": 0}, "--views must be"),
+        ({"height_m": 50, "deadline_s": 0.6}, "--deadline must be 0.02 to 20000 minutes, not 0.01"),
     ],
 )
 def test_options_that_cannot_be_meant(given, words):

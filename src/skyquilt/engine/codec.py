@@ -29,10 +29,13 @@ def encode(value: Any) -> bytes:
     return buffer.getvalue()
 
 
-def write(file: BinaryIO, value: Any) -> None:
-    """The same into a file, one array after another: large ones are not copied as a whole."""
+def write(file: BinaryIO, value: Any, name: str = "") -> None:
+    """The same into a file, one array after another: large ones are not copied as a whole. `name`
+    says whose value it is, so that it is not taken for another one.
+    """
     arrays = _Arrays()
     tree = _down(value, arrays)
+    tree = {"!": "named", "n": name, "v": tree} if name else tree
     np.savez(file, __tree__=np.frombuffer(json.dumps(tree).encode(), np.uint8), **arrays.named())
 
 
@@ -92,20 +95,28 @@ def decode(data: bytes, registry: Registry) -> Any:
     return read(io.BytesIO(data), registry)
 
 
-def read(file: BinaryIO, registry: Registry) -> Any:
-    """The same from a file.
+def read(file: BinaryIO, registry: Registry, name: str = "") -> Any:
+    """The same from a file; `name` as it was written.
 
     Raises:
-        ValueError: it is damaged, or names an unknown record.
+        ValueError: it is damaged, has another name, or names an unknown record.
     """
     try:
         with np.load(file, allow_pickle=False) as arrays:
             tree = json.loads(bytes(arrays["__tree__"]).decode())
+            tree = tree if not name else _named(tree, name)
             return _up(tree, _Read(arrays), registry)
     except (
         Exception
     ) as error:  # damaged zip, npy and JSON raise many exceptions; all mean: no valid record
         raise ValueError(f"not a stored record: {error}") from error
+
+
+def _named(tree: Any, name: str) -> Any:
+    """What was written under a name."""
+    if not isinstance(tree, dict) or tree["!"] != "named" or tree["n"] != name:
+        raise ValueError("it holds another result")
+    return tree["v"]
 
 
 def _down(value: Any, arrays: _Arrays) -> Any:

@@ -205,11 +205,11 @@ class Store:
     _made: set[str] = field(default_factory=set)
 
     def get(self, stage: str, key: str) -> Any | None:
-        """The stored result, or None when there is none or the file is damaged."""
+        """The stored result, or None when there is none or the file is damaged, or another's."""
         path = self.folder / stage / f"{key}.npz"
         try:
             with open_regular(path) as file:
-                value = read(file, self.registry)
+                value = read(file, self.registry, f"{stage}/{key}")
         except (OSError, ValueError, TypeError):
             return None
         self.hits += 1
@@ -240,7 +240,7 @@ class Store:
                 self.within.stat()
             path.parent.mkdir(parents=True, exist_ok=True)
             with partial.open("wb") as file:
-                write(file, value)
+                write(file, value, f"{stage}/{key}")
             put_in_place(partial, path)
         except OSError as error:
             with suppress(OSError):

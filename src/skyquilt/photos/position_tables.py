@@ -30,7 +30,7 @@ from skyquilt.photos.side_rows import (
 )
 
 if TYPE_CHECKING:
-    from pyproj import Transformer
+    from pyproj import CRS, Transformer
 
 _COLUMNS = {
     "name": (
@@ -118,6 +118,11 @@ _HEIGHT = re.compile(
 )
 
 
+def system_of(crs: "CRS") -> str:
+    """A coordinate system as text; empty where it counts degrees."""
+    return "" if crs.is_geographic else crs.to_wkt()
+
+
 def states_crs(line: str) -> bool:
     """Whether a line names a coordinate system, as the first one of a `geo.txt` does."""
     return _STATED_CRS.fullmatch(line.strip()) is not None
@@ -182,8 +187,9 @@ def read_positions(path: Path) -> tuple[tuple[SideRow, ...], tuple[str, ...]]:
         rows.append(_row(cells, columns, f"{path.name}, row {i}"))
     if system is not None:
         degrees, datum, unit_m = to_degrees(system), datum_of(system), metres_of_height(system)
+        named_system = system_of(system)
         rows = [
-            _placed(row, cells, columns, degrees, datum, unit_m)
+            replace(_placed(row, cells, columns, degrees, datum, unit_m), system=named_system)
             for row, (_, cells) in zip(rows, named, strict=True)
         ]
         notes += unit_notes(path, system, [row.altitude_m for row in rows])

@@ -4,6 +4,7 @@ import math
 import os
 import re
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +12,7 @@ from skyquilt.errors import SideFileError
 from skyquilt.model.photo import Datum, Photo
 from skyquilt.outside import plain
 from skyquilt.photos.pos_events import read_pos
-from skyquilt.photos.position_tables import has_header, read_positions, states_crs
+from skyquilt.photos.position_tables import has_header, read_positions, states_crs, system_of
 from skyquilt.photos.side_rows import (
     SideRow,
     accuracy,
@@ -126,12 +127,13 @@ def read_geo_txt(path: Path) -> tuple[SideRow, ...]:
             " photo."
         )
     crs = read_crs(lines[0][1], file=path.name)
-    degrees, datum = to_degrees(crs), datum_of(crs)
+    degrees, datum, system = to_degrees(crs), datum_of(crs), system_of(crs)
     unit_m = metres_of_height(crs)
-    return tuple(
+    rows = (
         _geo_txt_row(text, f"{path.name}, line {i}", degrees, datum, unit_m)
         for i, text in lines[1:]
     )
+    return tuple(replace(row, system=system) for row in rows)
 
 
 def _geo_txt_row(

@@ -49,6 +49,8 @@ class SideRow:
     """Horizontal standard deviation in m."""
     sigma_z_m: float | None = None
     """Vertical standard deviation in m."""
+    system: str = ""
+    """The coordinate system in which the file has x and y; empty where it has degrees."""
 
 
 class PhotoNames:
@@ -196,7 +198,8 @@ def _compared(
         for p, r in both
         if r.latitude_deg is not None and r.longitude_deg is not None
     ]
-    yield from check_positions(file, [own for own, _ in pairs], [there for _, there in pairs])
+    system = next((r.system for _, r in both), "")
+    yield from check_positions(file, [p for p, _ in pairs], [there for _, there in pairs], system)
     heights = [(_height(p, r.datum), r.altitude_m) for p, r in both]
     known = [(own, there) for own, there in heights if own is not None and there is not None]
     yield from check_heights(file, [own for own, _ in known], [there for _, there in known])

@@ -43,6 +43,7 @@ class PlanSettings:
         """The settings unchanged; raises UsageError where values cannot be meant."""
         if (self.gsd_cm is None) == (self.height_m is None):
             raise UsageError("give either --gsd (cm) or --height (m)")
+        minutes = None if self.deadline_s is None else self.deadline_s / 60
         for name, value, low, high, unit in (
             ("--gsd", self.gsd_cm, 0.01, 1000, "cm"),
             ("--height", self.height_m, 2, 10_000, "m"),
@@ -53,7 +54,7 @@ class PlanSettings:
             ("--clearance", self.clearance_m, 0, 1000, "m"),
             ("--separation", self.separation_m, 0, 1000, "m"),
             ("--wind", self.wind_ms, 0, 60, "m/s"),
-            ("--deadline", self.deadline_s, 1, 1e6, "s"),
+            ("--deadline", minutes, 0.02, 20_000, "minutes"),
             ("--seconds", self.seconds, 0.1, 3600, "s"),
         ):
             if value is not None and not (math.isfinite(value) and low <= value <= high):
