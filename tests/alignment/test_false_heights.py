@@ -47,7 +47,7 @@ def test_heights_that_most_others_contradict_are_not_used(false, by_m, seed):
 @pytest.mark.parametrize("sigma", [0.03, 3.0, 15.0])
 def test_heights_with_errors_of_receivers_and_barometers_are_used(sigma):
     noise = noisy(20, sigma)
-    drift = np.linspace(0, 60, 20) - 30
+    drift = np.linspace(0, 40, 20) - 20
     flights = np.repeat([0.0, 12.0], 10)
     for heights in (noise, noise + drift, noise + flights):
         case = told_at(heights, sigma, 20.0)
@@ -66,6 +66,23 @@ def test_those_that_know_less_may_differ_more():
     sigma = np.where(np.arange(20) % 5, 0.03, 15.0)
     heights = 60 + np.where(np.arange(20) % 5, 0.02, 30.0)
     assert outvoted_heights(*told_at(heights, sigma, 6.0)) is None
+
+
+@pytest.mark.parametrize(("second", "third"), [(10, 20), (4, 20), (15, 20), (8, 14)])
+@pytest.mark.parametrize("by_m", [-40.0, 100.0])
+def test_heights_above_several_take_off_points_count_from_that_of_most_photos(second, third, by_m):
+    """Of equally many, from the first one."""
+    heights = noisy(20)
+    heights[second:] += by_m
+    heights[third:] += by_m
+    parts = [range(second), range(second, third), range(third, 20)]
+    found, names, priors = told_at(heights, lifted_m=float(heights.mean()) - 60)
+    found = replace(found, frame=replace(found.frame, vertical_datum="takeoff"))
+    told = outvoted_heights(found, names, priors)
+    kept = [i for i, p in enumerate(told.priors) if np.isfinite(p.map_C[2])]
+    assert kept == list(max(parts, key=len))
+    assert "take-off point" in told.note
+    assert height_warnings(priors, replace(found, notes=(told.note,))) == []
 
 
 @pytest.mark.parametrize("by_m", [-440.0, 60.0])

@@ -1,5 +1,6 @@
 """Reported heights of some photos that those of the others and the pictures contradict: heights in
-feet among metres, above take-off among those above sea level, of another datum, or made up.
+feet among metres, above take-off among those above sea level, above another take-off point, of
+another datum, or made up.
 
 Pictures tell heights against one another, but not from where these count. Taken for right, false
 heights lift or lower the whole map by their share of the difference.
@@ -15,6 +16,7 @@ from skyquilt.alignment.crowded_positions import without_heights
 from skyquilt.model.poses import Alignment, Prior
 from skyquilt.photos.side_rows import sentence_of
 
+Numbers = NDArray[np.float64]
 FEWEST = 4
 """Photos with heights that are needed to judge them."""
 AGREE, BETWEEN = 5.0, 0.1
@@ -24,6 +26,8 @@ occur, as of a barometer that drifts, and nobody is outvoted.
 """
 APART_M = 20.0
 """Receivers and barometers err by metres; so far apart, heights are wrong in another way."""
+UNUSED = "These heights are not used."
+"""Words of the note by which an alignment tells that."""
 MEANT = 2.0
 """The map lies by the others where it misses them by less than this times what their mean errs by.
 """
@@ -39,9 +43,7 @@ class FalseHeights:
     """What is said of them."""
 
 
-def _differences(
-    found: Alignment, priors: Sequence[Prior]
-) -> tuple[list[int], NDArray[np.float64], NDArray[np.float64]]:
+def _differences(found: Alignment, priors: Sequence[Prior]) -> tuple[list[int], Numbers, Numbers]:
     """Photos that report a height, by how many m it lies above where they were found, and the
     deviations in m that they state; none of a map without a place.
     """
@@ -51,19 +53,44 @@ def _differences(
     return own, off, np.array([priors[i].sigma_C[2] for i in own], np.float64)
 
 
+def _majority(off: Numbers, stated: Numbers) -> NDArray[np.bool_] | None:
+    """Which differences agree with most others; None where there is no majority."""
+    away = np.abs(off - np.median(off))
+    limit = AGREE * np.maximum(np.median(away), stated)
+    agree = away < limit
+    if 2 * agree.sum() <= len(off) or (agree & (2 * away > limit)).mean() > BETWEEN:
+        return None
+    return np.asarray(agree)
+
+
+def _flights(off: Numbers, stated: Numbers) -> NDArray[np.bool_] | None:
+    """Which differences are those of the flight with most photos, of equally many the first one,
+    where flights one after the other have heights above take-off points of their own. None where
+    they have not.
+    """
+    order = np.argsort(off)
+    wide = np.diff(off[order]) > max(APART_M, AGREE * float(np.median(stated)))
+    group = np.empty(len(off), np.int64)
+    group[order] = np.cumsum(np.r_[False, wide])
+    if not wide.any() or np.count_nonzero(np.diff(group)) != wide.sum():
+        return None
+    count = np.bincount(group)[group]
+    return np.asarray(group == group[np.argmax(count)])
+
+
 def outvoted_heights(
     found: Alignment, names: Sequence[str], priors: Sequence[Prior]
 ) -> FalseHeights | None:
-    """The priors without the heights of photos that contradict those of most others. None where no
-    majority agrees, or where the map lies by it already.
+    """The priors without the heights of photos that contradict those of most others; of flights
+    from several take-off points without those of all but one. Photos are in order of capture. None
+    where no majority agrees, or where the map lies by it already.
     """
     own, off, stated = _differences(found, priors)
     if len(own) < FEWEST:
         return None
-    away = np.abs(off - np.median(off))
-    limit = AGREE * np.maximum(np.median(away), stated)
-    agree = away < limit
-    if agree.all() or 2 * agree.sum() <= len(own) or (agree & (2 * away > limit)).mean() > BETWEEN:
+    flights = _flights(off, stated) if found.frame.vertical_datum == "takeoff" else None
+    agree = _majority(off, stated) if flights is None else flights
+    if agree is None or agree.all():
         return None
     middle = float(off[agree].mean())
     apart = float(np.median(np.abs(off[~agree] - middle)))
@@ -75,9 +102,13 @@ def outvoted_heights(
     for i, bare in zip(false, without_heights([priors[i] for i in false]), strict=True):
         out[i] = bare
     named = sentence_of([names[i] for i in false])
+    why = ""
+    if flights is not None:
+        why = " Perhaps these are flights from another take-off point: heights count from that of"
+        why += " the others."
     note = (
         f"The heights of {len(false)} of {len(own)} photos lie {apart:.0f} m (median) from where"
-        f" the others and the pictures put them: {named}. They are not used."
+        f" the others and the pictures put them: {named}. {UNUSED}{why}"
         " If these are the right ones, the map lies higher or lower by as much."
     )
     return FalseHeights(priors=tuple(out), note=note)
@@ -86,10 +117,10 @@ def outvoted_heights(
 def height_warnings(priors: Sequence[Prior], alignment: Alignment) -> list[str]:
     """A sentence where reported heights contradict one another, and no majority agrees."""
     own, off, stated = _differences(alignment, priors)
-    if len(own) < FEWEST:
+    if len(own) < FEWEST or any(UNUSED in note for note in alignment.notes):
         return []
     apart, usual = float(np.median(np.abs(off - np.median(off)))), float(np.median(stated))
-    if apart <= max(AGREE * usual, APART_M):
+    if apart <= max(AGREE * usual, APART_M / 2):
         return []
     return [
         f"The reported heights contradict the pictures: half of the photos lie more than"
