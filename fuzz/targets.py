@@ -12,8 +12,10 @@ import zipfile
 from collections.abc import Callable
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
+from datetime import datetime
 from functools import cache
 from pathlib import Path
+from typing import get_args
 
 import cv2
 import numpy as np
@@ -47,8 +49,12 @@ from skyquilt.planning.view import find_view
 from skyquilt.raster.boundary import read_boundary
 from skyquilt.server.layer_endpoints import LayerError, checked
 from skyquilt.server.layer_files import layer_of_bytes
+from skyquilt.simulate.clip_tracks import add_track, track_in_clip
+from skyquilt.simulate.reported import Report
+from skyquilt.simulate.settings import InClipLayout, Video
 from skyquilt.video.codec_size import codec_sizes
 from skyquilt.video.container import read_container
+from skyquilt.video.inside import track_inside
 from skyquilt.video.positions import places_at
 from skyquilt.video.tracks import TRACK_ENDINGS, read_track
 
@@ -233,13 +239,34 @@ def _clips():
         writer.release()
         data = path.read_bytes()
     model = b"\xa9mdl\x00\x06\x15\xc7FC3170\x00"
-    return [data, data + struct.pack(">I4s", 8 + len(model), b"udta") + model]
+    return [
+        data,
+        data + struct.pack(">I4s", 8 + len(model), b"udta") + model,
+        *(_with_telemetry(data, layout) for layout in get_args(InClipLayout)),
+    ]
+
+
+def _with_telemetry(clip, layout):
+    """A clip with two seconds of telemetry in it, as a drone writes it."""
+    report = Report(
+        latitude=46.6, longitude=14.3, sea_level=480.0, takeoff=50.0, gimbal=(12.0, -90.0, 0.0),
+        flight_yaw=12.0, clock=0.0, focal=None, turned=False, lies=(),
+    )  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.mp4"
+        path.write_bytes(clip)
+        times, video = np.arange(4) / 2, Video(fps=2.0, layout=layout)
+        add_track(path, track_in_clip([report] * 4, times, video, datetime(2024, 5, 1, 10)))
+        return path.read_bytes()
 
 
 def _container(data):
-    """The boxes of a clip; FFmpeg, which decodes it, is fuzzed by others."""
-    found = read_container(_file("a.mp4", data))
+    """Boxes of a clip and the telemetry in it; FFmpeg, which decodes it, is fuzzed by others."""
+    path = _file("a.mp4", data)
+    found = read_container(path)
     assert found is None or all(k.isprintable() for k in (found.model, *found.kinds))
+    if (track := track_inside(path)) is not None:
+        assert np.isfinite(track.latitude_deg).all() and len(track.time_s) > 0
 
 
 @cache

@@ -56,6 +56,26 @@ def test_a_clip_with_telemetry(flight, tmp_path):
     assert again.metrics["seconds"] == result.metrics["seconds"]
 
 
+def test_telemetry_in_the_clip_places_it(tmp_path):
+    """Messages of frames, as newer drones write them, and no file beside the clip."""
+    settings = sim.FlightSettings(
+        lens=Lens().scaled(480, 360),
+        route=Route(photos=6, sidelap=0.4, speed=8.0),
+        video=Video(fps=5.0, layout="mini4"),
+    )
+    for _ in sim.simulate(settings, tmp_path / "flight"):
+        pass
+    assert [p.name for p in (tmp_path / "flight" / "video").iterdir()] == ["FLIGHT.MP4"]
+    truth = json.loads((tmp_path / "flight" / "truth" / "truth.json").read_text())
+    result = skyquilt.mosaic(tmp_path / "flight" / "video", tmp_path / "map")
+    assert result.metrics["georeferenced"] and result.metrics["vertical_datum"] == "takeoff"
+    solved, true, numbers = centres(tmp_path / "map", truth["clips"][0]["frames"])
+    assert len(numbers) > 5
+    off = solved - true
+    assert np.abs(off[:, :2].mean(axis=0)).max() < 4.0  # of the receiver, 2 m
+    assert (off - off.mean(axis=0))[:, :2].std() < 1.0
+
+
 def test_what_is_said_of_frames_is_asked_when_they_are_known(flight, tmp_path):
     """Calibrations by name of the frames' camera, and a zero that their positions must allow."""
     clip = flight[0] / "video" / "FLIGHT.MP4"

@@ -138,8 +138,23 @@ def command(
         float | None, typer.Option(help="the clip ends after so many seconds")
     ] = None,
     srt_layout: Annotated[
-        Literal["mavic3", "gimbal", "air2s", "mavic2", "p4rtk", "mavic-pro", "matrice300"] | None,
-        typer.Option(help="layout of the clip's telemetry, by the drone that writes it"),
+        Literal[
+            "mavic3",
+            "gimbal",
+            "air2s",
+            "mavic2",
+            "p4rtk",
+            "mavic-pro",
+            "matrice300",
+            "mini2",
+            "mini4",
+            "gopro",
+        ]
+        | None,
+        typer.Option(
+            help="layout of the clip's telemetry, by the drone that writes it; the last three"
+            " write it into the clip"
+        ),
     ] = None,
     srt_shift: Annotated[
         float | None, typer.Option(help="seconds by which the telemetry is late")

@@ -22,7 +22,7 @@ class Track:
     file: str
     """Name of the file."""
     source: str
-    """`srt`, `gpx`, `csv` or `photos`."""
+    """`srt`, `gpx`, `csv`, `photos`, or `clip`: a track of data in the clip itself."""
     digest: str
     """Hash of what was read (hex)."""
     on_clip: bool

@@ -16,9 +16,10 @@ from skyquilt.photos.kept_frames import KEPT_QUALITY
 from skyquilt.photos.position_tables import has_header
 from skyquilt.photos.read import read_photo
 from skyquilt.photos.video_modes import with_mode
+from skyquilt.video.fixes import Fix, track_of
 from skyquilt.video.positions import attitude_at, clip_zero, flight_yaw_at, places_at, position_at
 from skyquilt.video.read import read_clip
-from skyquilt.video.tracks import TRACK_ENDINGS, Fix, is_timed_csv, merged, read_track, track_of
+from skyquilt.video.tracks import TRACK_ENDINGS, is_timed_csv, merged, read_track
 
 _SAME_START_S = 2.0
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from skyquilt.errors import OutputError
 from skyquilt.simulate.camera import Lens
+from skyquilt.simulate.clip_tracks import add_track, track_in_clip
 from skyquilt.simulate.control import lay_out, observations, survey, write_gcp_list
 from skyquilt.simulate.exif import Body, write_jpeg, write_tiff
 from skyquilt.simulate.expose import exposer, footprint
@@ -376,8 +377,12 @@ def _roll(
             )
     finally:
         writer.close()
-    text = telemetry(flight.reports, times, video, flight.lens, settings.weather.moment)
-    path.with_suffix(".SRT").write_text(text, encoding="utf-8")
+    track = track_in_clip(flight.reports, times, video, settings.weather.moment)
+    if track is not None:
+        add_track(path, track)
+    else:
+        text = telemetry(flight.reports, times, video, flight.lens, settings.weather.moment)
+        path.with_suffix(".SRT").write_text(text, encoding="utf-8")
     frames = [
         Taken(shot=s, report=r, band="visible", file="video/FLIGHT.MP4", exposure=1.0)
         for s, r in zip(flight.shots, flight.reports, strict=True)

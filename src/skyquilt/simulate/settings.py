@@ -224,6 +224,7 @@ class Multispectral:
 
 
 SrtLayout = Literal["mavic3", "gimbal", "air2s", "mavic2", "p4rtk", "mavic-pro", "matrice300"]
+InClipLayout = Literal["mini2", "mini4", "gopro"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -234,9 +235,9 @@ class Video:
     """Frames per second."""
     seconds: float | None = None
     """The clip ends after so many seconds; None = at the last waypoint."""
-    layout: SrtLayout = "mavic3"
-    """Layout of the telemetry, by a drone that writes it so; `gimbal`: `mavic3` with the gimbal's
-    angles.
+    layout: SrtLayout | InClipLayout = "mavic3"
+    """Layout of the telemetry, by a drone that writes it so beside the clip (`gimbal`: `mavic3`
+    with the gimbal's angles), or into it.
     """
     shift: float = 0.0
     """Seconds by which the telemetry's times are late against the pictures."""

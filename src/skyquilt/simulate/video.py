@@ -293,7 +293,7 @@ def _written(
     )
 
 
-_LAYOUTS = {
+_LAYOUTS: dict[str, _Layout] = {
     "mavic3": _Layout(text=_bracketed()),
     "gimbal": _Layout(text=_bracketed(gimbal=True)),
     "air2s": _Layout(text=_bracketed(heights="sea")),

@@ -58,13 +58,13 @@ def is_video(head: bytes) -> bool:
 def read_container(path: Path) -> Container | None:
     """The header of a clip; None where the file is no MP4 or MOV. Raises `OSError`."""
     with open_regular(path) as file:
-        if file.read(12)[4:8] not in _MP4:
+        if not is_mp4(file):
             return None
         size = file.seek(0, io.SEEK_END)
         kinds: list[str] = []
         created, whole, model, declared = None, False, "", None
         coded: list[tuple[int, int]] = []
-        for name, body, length in _boxes(file, 0, size):
+        for name, body, length in boxes(file, 0, size):
             whole |= name == b"moov"
             file.seek(body)
             if name == b"hdlr":
@@ -90,7 +90,12 @@ def read_container(path: Path) -> Container | None:
     )
 
 
-def _boxes(file: BinaryIO, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
+def is_mp4(file: BinaryIO) -> bool:
+    """Whether a file, read from its beginning, is an MP4 or MOV."""
+    return file.read(12)[4:8] in _MP4
+
+
+def boxes(file: BinaryIO, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
     """Names, starts of bodies and their lengths, depth first."""
     open_, count = [(start, end)], 0
     while open_ and count < _MOST_BOXES:

@@ -14,6 +14,7 @@ from skyquilt.model.photo import RejectedPhoto
 from skyquilt.outside import check_picture, open_regular
 from skyquilt.video.container import Container, is_video, read_container
 from skyquilt.video.decoder import Decoder
+from skyquilt.video.inside import track_inside
 from skyquilt.video.lens import video_focal, video_shutter
 from skyquilt.video.tracks import TRACK_ENDINGS, is_timed_csv, read_track
 
@@ -27,7 +28,8 @@ _PIECES, _PIECE = 64, 1 << 16
 def read_clip(path: Path, *, name: str, track: Track | None = None) -> Clip | RejectedPhoto:
     """The header of a clip, without looking through it; a bad one is a `RejectedPhoto`.
 
-    `track` replaces the positions beside it (`.srt`, `.gpx` or timed `.csv` of the same name).
+    `track` replaces the positions beside it (`.srt`, `.gpx` or timed `.csv` of the same name) and
+    in it.
     """
     try:
         return _clip(path, name, track)
@@ -54,7 +56,7 @@ def _clip(path: Path, name: str, track: Track | None) -> Clip:
         decoder.close()
     notes: tuple[str, ...] = ()
     if track is None:
-        track, notes = _beside(path)
+        track, notes = _positions(path)
     start = _start(track, box)
     size = (decoder.width, decoder.height)
     focal_35mm, zoom = (track.focal_35mm, track.zoom) if track else (None, 1.0)
@@ -133,15 +135,17 @@ def side_files(path: Path) -> list[Path]:
     return sorted(found, key=lambda p: TRACK_ENDINGS.index(p.suffix.lower()))
 
 
-def _beside(path: Path) -> tuple[Track | None, tuple[str, ...]]:
-    """The first file beside a clip that holds positions, and notes on those that do not."""
+def _positions(path: Path) -> tuple[Track | None, tuple[str, ...]]:
+    """Those of the first file beside a clip that holds some, otherwise those in the clip, and notes
+    on files that hold none.
+    """
     notes: list[str] = []
     for file in side_files(path):
         try:
             return read_track(file), tuple(notes)
         except SideFileError as error:
             notes.append(f"{str(error).rstrip('.')}; it was not used.")
-    return None, tuple(notes)
+    return track_inside(path), tuple(notes)
 
 
 def _start(track: Track | None, box: Container | None) -> datetime | None:
@@ -165,7 +169,7 @@ def _notes(decoder: Decoder, track: Track | None, start: datetime | None) -> tup
             " the sensor recorded them."
         )
     if track is None:
-        out.append("No positions are beside it.")
+        out.append("No positions are in it or beside it.")
     elif track.repeats:
         out.append(
             f"{track.file} holds {len(track.time_s)} positions; {track.repeats} more rows only"

@@ -91,7 +91,7 @@ def read_samples(path: Path) -> tuple[Sample, ...]:
     text = side_text(path)
     if "\x00" in text:
         raise SideFileError(f"{path.name} is not a text file; expected DJI's telemetry subtitles.")
-    samples = tuple(_sample(index, block) for index, block in _blocks(text))
+    samples = tuple(sample_of(index, block) for index, block in _blocks(text))
     if not samples:
         raise SideFileError(
             f"{path.name} contains no subtitles; expected DJI's telemetry, with blocks that start"
@@ -125,10 +125,12 @@ def _blocks(text: str) -> Iterator[tuple[int, str]]:
     ]
     for start, end in zip(starts, [*starts[1:], len(lines)], strict=False):
         block = "".join(lines[start + 1 : min(end, start + 40)])
-        yield int(lines[start].strip()), block[:_MOST_BLOCK]
+        yield int(lines[start].strip()), block
 
 
-def _sample(index: int, text: str) -> Sample:
+def sample_of(index: int, text: str) -> Sample:
+    """What the text of one subtitle says; a number at its very end may be torn."""
+    text = text[:_MOST_BLOCK]
     for commas, points in _COMMAS:
         text = commas.sub(points, text)
     said: dict[str, tuple[str, float]] = {}

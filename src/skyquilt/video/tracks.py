@@ -1,11 +1,9 @@
 """Timed positions: DJI's SRT, GPX, CSV, or photos of another camera -> `Track`."""
 
 import csv
-import hashlib
 import io
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -17,31 +15,12 @@ from numpy.typing import NDArray
 from skyquilt.errors import SideFileError
 from skyquilt.model.clip import Track
 from skyquilt.outside import open_regular, plain, real, text_of
+from skyquilt.video.fixes import Fix, track_of
 from skyquilt.video.srt import Sample, read_samples, side_text
 
 Array = NDArray[np.float64]
 TRACK_ENDINGS = (".srt", ".gpx", ".csv")
 _FEET = 0.3048
-
-
-@dataclass(frozen=True, kw_only=True)
-class Fix:
-    """One row of a file; NaN = it does not say so."""
-
-    time_s: float
-    """s."""
-    latitude_deg: float = np.nan
-    """WGS 84."""
-    longitude_deg: float = np.nan
-    """WGS 84."""
-    takeoff_m: float = np.nan
-    """Height above take-off."""
-    sea_level_m: float = np.nan
-    """Height above sea level."""
-    gimbal_deg: tuple[float, float, float] = (np.nan, np.nan, np.nan)
-    """Yaw, pitch, roll."""
-    flight_yaw_deg: float = np.nan
-    """Heading of the aircraft."""
 
 
 def read_track(path: Path) -> Track:
@@ -59,58 +38,12 @@ def read_track(path: Path) -> Track:
     return reader(path)
 
 
-def track_of(
-    fixes: Sequence[Fix],
-    *,
-    file: str,
-    source: str,
-    on_clip: bool,
-    step_deg: float,
-    start: datetime | None = None,
-    focal_35mm: float | None = None,
-    zoom: float = 1.0,
-) -> Track:
-    """A track of rows in any order; raises `SideFileError` where none has a position."""
-    rows = sorted(fixes, key=lambda f: f.time_s)
-    times = np.array([f.time_s for f in rows])
-    places = np.array([(f.latitude_deg, f.longitude_deg) for f in rows]).reshape(-1, 2)
-    known = np.isfinite(places).all(axis=1) & (np.abs(places) > 0).any(axis=1)
-    if not known.any():
-        raise SideFileError(
-            f"{file} contains no position: none of its {len(rows)} rows has a latitude and a"
-            " longitude other than 0."
-        )
-    t, p = times[known], places[known]
-    changed = np.concatenate([[True], (np.diff(p, axis=0) != 0).any(axis=1)])
-    changed &= np.concatenate([[True], np.diff(t) > 0])
-    values = np.array([(f.takeoff_m, f.sea_level_m, *f.gimbal_deg, f.flight_yaw_deg) for f in rows])
-    content = hashlib.blake2b(times.tobytes() + places.tobytes() + values.tobytes()).hexdigest()
-    once = np.concatenate([[True], np.diff(times) > 0])
-    return Track(
-        file=file,
-        source=source,
-        digest=content[:32],
-        on_clip=on_clip,
-        time_s=t[changed],
-        latitude_deg=p[changed, 0],
-        longitude_deg=p[changed, 1],
-        step_deg=step_deg,
-        height_time_s=times[once],
-        takeoff_m=values[once, 0],
-        sea_level_m=values[once, 1],
-        gimbal_deg=values[once, 2:5],
-        flight_yaw_deg=values[once, 5],
-        start=start,
-        focal_35mm=focal_35mm,
-        zoom=zoom,
-        rows=len(rows),
-        zeros=int((~known).sum()),
-        repeats=int((~changed).sum()),
-    )
-
-
 def _read_srt(path: Path) -> Track:
-    samples = read_samples(path)
+    return track_of_subtitles(read_samples(path), file=path.name)
+
+
+def track_of_subtitles(samples: Sequence[Sample], *, file: str) -> Track:
+    """A track of DJI's subtitles; raises `SideFileError` where none has a position."""
     timed = _clip_times(samples)
     fixes = [_fix(s, t) for s, t in zip(samples, timed, strict=True)]
     first = next((i for i, s in enumerate(samples) if s.moment), None)
@@ -124,7 +57,7 @@ def _read_srt(path: Path) -> Track:
     zoom = [s.zoom for s in samples if s.zoom]
     return track_of(
         fixes,
-        file=path.name,
+        file=file,
         source="srt",
         on_clip=True,
         step_deg=10.0**-decimals,

@@ -193,7 +193,7 @@ def timed(
     if stated is not None:
         return replace(chosen, offset_s=stated, offset_source="option"), True, []
     zero = clip_zero(track, clip)
-    reach = _REACH_S if track.source == "srt" and track.on_clip else _ALL_S
+    reach = _REACH_S if track.source in ("srt", "clip") and track.on_clip else _ALL_S
     # where the two do not meet within reach, no time is as good as another
     found = methods.search(looks, track, zero, reach) or methods.search(looks, track, zero, _ALL_S)
     if found is not None and found.clear:
