@@ -121,7 +121,7 @@ def sentences(survey: "Survey", findings: tuple[str, ...]) -> Iterator[str]:
         tracked = sum(c.track is not None for c in survey.clips)
         count = len(survey.clips)
         videos = "1 video" if count == 1 else f"{count} videos"
-        yield f"{videos}, {tracked} with positions beside them."
+        yield f"{videos}, {tracked} with positions."
 
 
 def _cells(photo: "Photo") -> tuple[str, ...]:

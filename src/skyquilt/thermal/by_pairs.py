@@ -56,7 +56,7 @@ _GRID = 6
 _LEAST_PAIRS = 3
 """Fewest pairs that must be registered, and agree."""
 _SAMPLED = 8
-"""Pairs that are sought anywhere if none lies where positions say; a search takes seconds."""
+"""Pairs that are sought anywhere if too few lie where positions say; a search takes seconds."""
 T = TypeVar("T", bound=tuple[Any, ...])
 Told = tuple[PairPoints, bool]
 """Correspondences of a pair, and whether they were refined by colours."""
@@ -95,25 +95,20 @@ def registered_of(
 ) -> list[Told]:
     """What is registered of pairs, in their order. `near`, ten times as fast, compares a pair where
     the positions of both flights say. All pairs lie in one place: if it finds enough of them, the
-    others are not sought elsewhere; if it finds none, some are, and the rest if one of these is
-    found.
+    others are not sought elsewhere; otherwise some are, and the rest if one of these is found.
     """
     found: list[Told | None] = [near(*pair) for pair in asked]
     count = sum(one is not None for one in found)
     if count >= _LEAST_PAIRS:
         return [one for one in found if one is not None]
     rest = [k for k, one in enumerate(found) if one is None]
-    if not count:
-        some = sorted(
-            {rest[int(k)] for k in np.linspace(0, len(rest) - 1, _SAMPLED)} if rest else ()
-        )
-        for k in some:
-            found[k] = anywhere(*asked[k])
-        if all(found[k] is None for k in some):
-            return []
-        rest = [k for k in rest if k not in some]
-    for k in rest:
+    some = {rest[int(k)] for k in np.linspace(0, len(rest) - 1, _SAMPLED)} if rest else set()
+    for k in sorted(some):
         found[k] = anywhere(*asked[k])
+    if any(found[k] is not None for k in some):
+        for k in rest:
+            if k not in some:
+                found[k] = anywhere(*asked[k])
     return [one for one in found if one is not None]
 
 
