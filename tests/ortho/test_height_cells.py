@@ -104,3 +104,51 @@ def test_cells_whose_ground_lies_elsewhere_now_are_removed(how):
     assert set(left[np.isfinite(left)]) <= {height}
     assert np.isfinite(left).sum() == (0 if how == "nothing in common" else len(met))
     assert np.isnan(z).sum() == 400 - np.isfinite(left).sum()
+
+
+def hills(seed):
+    """Cells of hills, of which a third of those below a flight is known, and three far away."""
+    rng = np.random.default_rng(seed)
+    cells = HeightCells(cell=2.0)
+    own = rng.integers(0, 60, (1200, 2)) * (1, 2) + rng.integers(-40, 40, 2)
+    z = 300 + 12 * np.sin(own[:, 0] / 15) + 0.2 * own[:, 1] + rng.normal(0, 0.3, len(own))
+    cells.put(own, z)
+    cells.put(own.max(0) + np.array([(70, 3), (71, 3), (90, -20)]), np.array([340.0, 341.0, 280.0]))
+    return cells, own
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_heights_of_a_place_do_not_depend_on_the_part_that_is_asked_for(seed):
+    """Or neighbouring tiles would show their common edge in two places: a straight seam."""
+    cells, own = hills(seed)
+    low, high = 2.0 * own.min(0) - 620, 2.0 * own.max(0) + 680
+    whole = cells.surface((*low, *high), 290.0)
+    side = 61.4
+    for west in np.arange(low[0], high[0] - side, 2 * side):
+        for south in np.arange(low[1], high[1] - side, 2 * side):
+            tile = cells.surface((west, south, west + side, south + side), 290.0)
+            x, y = np.meshgrid(*(np.linspace(0, side, 9) + edge for edge in (west, south)))
+            assert tile.at(x, y) == pytest.approx(whole.at(x, y), abs=0.01)
+
+
+def test_ground_far_from_known_heights_goes_on_without_a_step_from_that_nearest_to_it():
+    """To what is taken for the ground where nothing is known, far away."""
+    cells = HeightCells(cell=2.0)
+    places = np.stack(np.meshgrid(np.arange(40), np.arange(40)), -1).reshape(-1, 2)
+    cells.put(places, 100 + 0.5 * places[:, 0])  # rises to the east by a quarter of a metre per m
+    x = np.arange(0.0, 4000.0, 2.0)
+    z = cells.surface((0.0, 20.0, 4000.0, 60.0), 150.0).at(x, np.full(len(x), 40.0))
+    assert np.abs(np.diff(z)).max() < 2 * 0.5
+    assert z[x < 70] == pytest.approx(100 + 0.25 * (x[x < 70] - 1), abs=0.5)
+    assert z[x == 110] == pytest.approx(120, abs=3)
+    assert z[-1] == pytest.approx(150, abs=1)
+    assert np.diff(z).min() > -0.5
+
+
+def test_a_map_of_which_nothing_is_known_is_level():
+    cells = HeightCells(cell=2.0)
+    assert np.all(cells.surface((0.0, 0.0, 90.0, 90.0), 12.5).z == 12.5)
+    cells.put(np.array([(3, 3)]), np.array([20.0]))
+    assert cells.surface((0.0, 0.0, 14.0, 14.0), 12.5).z == pytest.approx(20, abs=1)
+    cells.put(np.array([(3, 3)]), np.array([np.nan]))
+    assert np.all(cells.surface((0.0, 0.0, 90.0, 90.0), 12.5).z == 12.5)

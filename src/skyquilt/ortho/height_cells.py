@@ -1,5 +1,7 @@
 """Heights of a growing map: a grid of cells filled from ground points, and the surface over any
-part of it.
+part of it. The surface at a place is the same whatever part is asked for: tiles are drawn one by
+one, and where two took the ground at their common edge for different heights, a straight seam would
+run along it.
 """
 
 from collections.abc import Iterable, Iterator
@@ -13,6 +15,7 @@ from skyquilt.geometry.neighbours import nearest
 from skyquilt.model.surface import Surface
 
 Cells = NDArray[np.int64]
+Heights = NDArray[np.float32]
 WEIGHT = 0.4
 """Weight of new points in the height of a cell that already has one."""
 AROUND = 9
@@ -23,6 +26,24 @@ BLOCK = 32
 """Cells along a side of the blocks in which they are stored, so that parts of the map are read as
 arrays.
 """
+SQUARE = 8
+"""Cells along a side of the squares whose median heights tell the ground far from known cells."""
+BESIDE = 12
+"""Known squares by which that is told."""
+BEYOND = 256
+"""Cells beyond which a known square tells nothing; the less, the further away the nearest is."""
+WIDTHS = (1.0, 2.5, 6.0)
+"""Standard deviations in cells of the surroundings from which gaps are filled, one after the
+other.
+"""
+ENOUGH = 0.08
+"""Share of known cells in surroundings from which they fill a gap alone; of fewer, wider ones or
+ground far away count, too.
+"""
+REACH = 26
+"""Cells around a part of the map on which its heights depend: OpenCV cuts Gaussians off after four
+deviations.
+"""
 
 
 @dataclass(kw_only=True)
@@ -32,6 +53,10 @@ class HeightCells:
     cell: float
     """Side in m."""
     _blocks: dict[tuple[int, int], NDArray[np.float64]] = field(default_factory=dict)
+    _squares: dict[tuple[int, int], NDArray[np.float64]] = field(default_factory=dict)
+    """Known squares of blocks, (k, 4): column and row of their middle in cells, median height in m,
+    number of known cells; those of blocks that have changed since are missing.
+    """
 
     def add(
         self, xyz: NDArray[np.float64], *, anew: bool = False
@@ -80,6 +105,7 @@ class HeightCells:
         for key, mine, (column, row) in _by_block(cells):
             held = self._blocks.setdefault(key, np.full((BLOCK, BLOCK), np.nan))
             held[row, column] = z[mine]
+            self._squares.pop(key, None)
 
     def at(self, cells: NDArray[np.int64]) -> NDArray[np.float64]:
         """Heights (k,) in m of cells (k, 2); NaN where there is no point."""
@@ -142,19 +168,55 @@ class HeightCells:
         return z
 
     def surface(self, bounds: Iterable[float], otherwise: float) -> Surface:
-        """Heights over bounds (west, south, east, north) in m: gaps are filled from their
-        surroundings, and the result is slightly smoothed.
+        """Heights over bounds (west, south, east, north) in m, slightly smoothed. Gaps are filled
+        from their surroundings, and far from these from the ground nearest to them; `otherwise`:
+        the height in m where nothing is known.
         """
         c0, r0, c1, r1 = self._reach(bounds)
         c0, r0, c1, r1 = c0 - 3, r0 - 3, c1 + 3, r1 + 3
-        z = self._part(c0, r0, c1, r1).astype(np.float32)
+        around = self._part(c0 - REACH, r0 - REACH, c1 + REACH, r1 + REACH).astype(np.float32)
+        filled, share = _filled(around)
+        if (share < 1).any():
+            far = self._far(c0 - REACH, r0 - REACH, around.shape, otherwise)
+            filled = share * filled + (1 - share) * far
+        z = cv2.medianBlur(filled, 3)[REACH:-REACH, REACH:-REACH]
         return Surface(
-            z=_filled(z, otherwise),
+            z=np.ascontiguousarray(z, np.float32),
             x0=(c0 + 0.5) * self.cell,
             y0=(r0 + 0.5) * self.cell,
             cell=self.cell,
             source="tie points",
         )
+
+    def _far(self, c0: int, r0: int, shape: tuple[int, ...], otherwise: float) -> Heights:
+        """Heights (rows, columns) of cells from (c0, r0) on, as far as they are told by known ones
+        that are not near them.
+        """
+        known = self._squares_around(c0, r0, c0 + shape[1], r0 + shape[0])
+        if not len(known):
+            return np.full(shape, otherwise, np.float32)
+        first = np.array([c0, r0]) // SQUARE - 1
+        columns, rows = (np.array([c0 + shape[1], r0 + shape[0]]) // SQUARE + 2 - first).tolist()
+        middles = (np.indices((rows, columns))[::-1].reshape(2, -1).T + first + 0.5) * SQUARE
+        z = _told(known, middles, otherwise).reshape(rows, columns).astype(np.float32)
+        at = (
+            (np.arange(n) + low + 0.5) / SQUARE - 0.5 - f
+            for n, low, f in zip(shape[::-1], (c0, r0), first, strict=True)
+        )
+        column, row = np.meshgrid(*(a.astype(np.float32) for a in at))
+        return np.asarray(cv2.remap(z, column, row, cv2.INTER_LINEAR), np.float32)
+
+    def _squares_around(self, c0: int, r0: int, c1: int, r1: int) -> NDArray[np.float64]:
+        """Known squares (k, 4) that tell heights of columns c0 ... c1 of rows r0 ... r1."""
+        low, high = -BEYOND - 2 * SQUARE, BEYOND + 2 * SQUARE
+        found = [np.zeros((0, 4))]
+        for R in range((r0 + low) // BLOCK, (r1 + high) // BLOCK + 1):
+            for C in range((c0 + low) // BLOCK, (c1 + high) // BLOCK + 1):
+                held, squares = self._blocks.get((C, R)), self._squares.get((C, R))
+                if held is not None and squares is None:
+                    squares = self._squares[C, R] = _squares((C, R), held)
+                found += [] if squares is None else [squares]
+        return np.concatenate(found)
 
 
 def _by_block(cells: Cells) -> Iterator[tuple[tuple[int, int], NDArray[np.bool_], Cells]]:
@@ -176,20 +238,45 @@ def _medians(group: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[n
     return np.asarray((ordered[first + (number - 1) // 2] + ordered[first + number // 2]) / 2)
 
 
-def _filled(z: NDArray[np.float32], otherwise: float) -> NDArray[np.float32]:
-    """Fills gaps from increasingly wide surroundings; outlier cells are replaced by their
-    neighbours' median.
+def _squares(block: tuple[int, int], held: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Known squares (k, 4) of a block of cells, see `HeightCells._squares`."""
+    row, column = np.nonzero(np.isfinite(held))
+    number = row // SQUARE * BLOCK + column // SQUARE
+    found, which, many = np.unique(number, return_inverse=True, return_counts=True)
+    z = _medians(which.ravel(), held[row, column])
+    corner = np.stack([found % BLOCK, found // BLOCK], 1) * SQUARE + np.array(block) * BLOCK
+    return np.column_stack([corner + SQUARE / 2, z, many])
+
+
+def _told(
+    known: NDArray[np.float64], places: NDArray[np.float64], otherwise: float
+) -> NDArray[np.float64]:
+    """Heights (n,) in m at places (n, 2), in cells, by the known squares (k, 4) nearest to them:
+    continuous, since the weight of the last of these is zero (Shepard's method as modified by
+    Franke and Little).
+    """
+    distance, at = nearest(known[:, :2], places, min(BESIDE, len(known)))
+    distance = np.maximum(distance, 0.5)
+    last = distance[:, -1:] if len(known) >= BESIDE else float(BEYOND)
+    weight = known[at, 3] * np.maximum(1 / distance - 1 / np.minimum(last, BEYOND), 1e-9) ** 2
+    z = (weight * known[at, 2]).sum(1) / weight.sum(1)
+    share = np.maximum(1 - distance[:, 0] / BEYOND, 0) ** 2
+    return np.asarray(share * z + (1 - share) * otherwise)
+
+
+def _filled(z: Heights) -> tuple[Heights, Heights]:
+    """Fills gaps from increasingly wide surroundings; returns the heights and, from 0 to 1, how
+    much they count against those of ground far away.
     """
     known = np.isfinite(z)
-    if known.sum() < 4:
-        return np.full(z.shape, np.median(z[known]) if known.any() else otherwise, np.float32)
     value, weight = np.where(known, z, 0).astype(np.float32), known.astype(np.float32)
-    out, filled = np.full(z.shape, np.float32(np.median(z[known]))), np.zeros(z.shape, bool)
-    for sigma in (1.0, 2.5, 6.0):
-        w = cv2.GaussianBlur(weight, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
-        v = cv2.GaussianBlur(value, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT) / np.maximum(
-            w, 1e-6
+    out, share = np.zeros(z.shape, np.float32), np.zeros(z.shape, np.float32)
+    for sigma in WIDTHS:
+        w, v = (
+            cv2.GaussianBlur(one, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
+            for one in (weight, value)
         )
-        now = (w > 0.08) & ~filled
-        out[now], filled = v[now], filled | now
-    return np.asarray(cv2.medianBlur(out, 3), np.float32)
+        more = (1 - share) * np.minimum(w / ENOUGH, 1)
+        out += more * v / np.maximum(w, 1e-9)
+        share += more
+    return np.asarray(out / np.maximum(share, 1e-9), np.float32), np.asarray(share, np.float32)
