@@ -93,8 +93,12 @@ class Survey:
             on_map=lambda: [self.member],
             camera=lambda m: None,
         )
+        self.told = list[int]()
+        """Photos of which it was told where they are drawn."""
         events = SimpleNamespace(
-            place=lambda m: ([], None), photo=lambda *a, **k: None, tiles=lambda t: None
+            place=lambda m: ([], None),
+            photo=lambda m, **k: self.told.append(m.id),
+            tiles=lambda t: None,
         )
         self.queue = RedrawQueue(members, self.tiles, events)
 
@@ -154,3 +158,19 @@ def test_what_lies_where_it_was_drawn_is_not_drawn_again():
         survey.queue.take_note()
     assert not survey.queue.dirty
     assert not Survey(5.0, drawn=5.0).queue.dirty
+
+
+@pytest.mark.parametrize("how", ["altered", "changed"])
+def test_a_new_photo_that_looks_different_before_it_is_drawn_is_drawn_once_and_told_at_once(how):
+    """It waited for its neighbours, and what stood by its metadata counts as found by them now."""
+    survey = Survey(5.0)
+    queue, member = survey.queue, survey.member
+    queue.dirty.clear()
+    queue.held.add(1)
+    getattr(queue, how)(member)
+    assert not queue.urgent and not queue.pending
+    queue.show(member)
+    getattr(queue, how)(member)
+    queue.draw(queue.urgent)
+    assert survey.told == [1]
+    assert not (survey.wrong() or queue.urgent or queue.dirty or queue.pending)

@@ -74,6 +74,9 @@ class RedrawQueue:
         """Queues the tiles of a new photo as urgent."""
         self._look_for_marks(member)
         self.held.discard(member.id)
+        self._show(member)
+
+    def _show(self, member: Member) -> None:
         self._to_draw.add(member.id)
         _add(self.urgent, self._placed(member), member.id)
 
@@ -104,13 +107,19 @@ class RedrawQueue:
     def altered(self, member: Member) -> None:
         """Notes that another part of a photo is shown than before, wherever it lies."""
         if member.pose is not None and member.state != "superseded":
-            self._remarked.add(member.id)
+            if member.id in self._drawn:
+                self._remarked.add(member.id)
             self.changed(member)
 
     def changed(self, member: Member) -> None:
-        """Notes that a photo looks different; its tiles are determined later."""
-        self._to_draw.add(member.id)
-        self.pending[member.id] = None
+        """Notes that a photo looks different; its tiles are determined later. One that was not
+        drawn yet is drawn as it looks now; one that is held, as it looks then.
+        """
+        if member.id in self._drawn:
+            self._to_draw.add(member.id)
+            self.pending[member.id] = None
+        elif member.id not in self.held:
+            self._show(member)
 
     def moved(self, member: Member) -> None:
         """Notes that a photo has moved; it is drawn again if the change is visible, and at once if
