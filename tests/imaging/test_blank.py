@@ -1,5 +1,7 @@
 """Black rims of pictures against the shapes that were drawn, and dark ground that is none."""
 
+import warnings
+
 import cv2
 import numpy as np
 import pytest
@@ -121,6 +123,12 @@ def test_even_ground_is_no_frame(kind):
     if kind == "exposures":
         pictures = [np.where(side, 120 + 3 * i, p) for i, p in enumerate(pictures)]
     assert blank_rim([np.round(p).astype(np.uint8) for p in pictures]) is None
+
+
+def test_pictures_of_one_colour_have_no_frame():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # of a colour that all pixels have, no others are counted
+        assert blank_rim([np.full((48, 64), 120, np.uint8)] * 4) is None
 
 
 def test_a_see_through_photo_tells_for_itself():

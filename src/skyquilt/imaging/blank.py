@@ -178,7 +178,8 @@ def _of_one_colour(lightest: NDArray[np.uint8], darkest: NDArray[np.uint8]) -> l
             (light <= level + by) & (dark >= max(level - by, BLACK + 1)) for by in (EVEN, NEARLY)
         )
         _, label = cv2.connectedComponents(nearly.astype(np.uint8), connectivity=4)
-        share = np.bincount(label[even], minlength=label.max() + 1) / np.bincount(label.ravel())
+        size = np.maximum(np.bincount(label.ravel()), 1)  # perhaps of no pixel of another colour
+        share = np.bincount(label[even], minlength=len(size)) / size
         found.append(np.asarray((share >= MOSTLY)[label] & nearly))
     return found
 
