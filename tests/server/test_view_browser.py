@@ -297,7 +297,10 @@ def test_control_points_from_the_list_to_the_residuals(browser, site, flight, ru
         holds(page, f"marksOf('{name}').length == 1")
         marked = page.evaluate(f"marksOf('{name}')[0]")
         assert np.hypot(marked["x"] - px, marked["y"] - py) < 1.0
-        page.click("#propose")
+        page.hover("#propose")
+        page.mouse.down()
+        page.evaluate("drawLoupes()")  # as when an answer arrives meanwhile
+        page.mouse.up()
         holds(page, "/proposed|no other photo/.test(document.querySelector('#said').textContent)")
         page.evaluate("document.querySelector('#said').textContent = ''")
     marks = page.evaluate("control.marks.length")

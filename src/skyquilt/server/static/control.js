@@ -178,16 +178,22 @@ const drawLoupes = () => {
   if (!box) return;
   const point = control.points.find((p) => p.name === control.chosen);
   if (!point) { box.replaceChildren(); return; }
-  const row = element("div", undefined, "row"), zoom = element("select");
+  // its buttons stay when an answer arrives: a press on one that is replaced before it ends is lost
+  const row = box.querySelector(":scope > .row") || loupeTools(), rows = control.rows.map((r) => loupe(point, r));
+  row.querySelector("select").value = control.zoom;
+  row.querySelector("#propose").disabled = !marksOf(point.name).length;
+  if (!row.parentNode) box.replaceChildren(row);
+  while (row.nextSibling) row.nextSibling.remove();
+  row.after(...(rows.length ? rows : [element("p", "No photo of the map shows this place; check its coordinates.")]));
+};
+const loupeTools = () => {
+  const row = element("div", undefined, "row"), zoom = element("select"), propose = button("Propose the others", () => lookUp(true));
   zoom.setAttribute("aria-label", "size of the detail");
   for (const n of [60, 120, 300, 800]) { const o = element("option", `${n} px of the photo`); o.value = n; zoom.append(o); }
-  zoom.value = control.zoom;
   zoom.onchange = () => { control.zoom = Number(zoom.value); drawLoupes(); };
-  const propose = button("Propose the others", () => lookUp(true));
-  propose.id = "propose"; propose.disabled = !marksOf(point.name).length;
+  propose.id = "propose";
   row.append(zoom, propose);
-  const rows = control.rows.map((r) => loupe(point, r));
-  box.replaceChildren(row, ...(rows.length ? rows : [element("p", "No photo of the map shows this place; check its coordinates.")]));
+  return row;
 };
 // Browsers tell a click in whole pixels of the screen: what was meant is the middle of one.
 const middle = (at) => (Number.isInteger(at) ? at + 0.5 : at);
