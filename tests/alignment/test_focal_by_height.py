@@ -40,6 +40,7 @@ def test_heights_and_positions_tell_it(times, gps):
     assert high == pytest.approx(44, rel=0.05)  # above ground of a metre
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("times", "source", "heights"), [(1.3, "guess", True), (3.0, "guess", False)]
 )

@@ -56,6 +56,7 @@ def test_a_turned_line_is_found(straight):
     assert_residuals_fit(found, (7, 13))
 
 
+@pytest.mark.slow
 def test_files_that_were_only_rewritten_stay(straight):
     flown = silent(dict.fromkeys(LINE, "Some Editor"))
     found = flown.aligned()
@@ -70,12 +71,14 @@ def test_of_two_programs_the_one_that_turns_is_told():
     assert turned_in(found) == set(LINE)
 
 
+@pytest.mark.slow
 def test_a_lens_in_the_middle_does_not_tell():
     """Nothing is turned on the strength of noise, and nothing depends on it."""
     found = silent(turned=LINE, lens=MIDDLE).aligned()
     assert not turned_in(found)
 
 
+@pytest.mark.slow
 def test_where_all_files_are_rewritten_nothing_is_turned():
     """The picture of a lens is as likely as the same turned."""
     flown = silent(dict.fromkeys(range(18), "Some Viewer"))

@@ -620,6 +620,7 @@ def test_two_control_points_are_too_few_without_metadata(mosaic, photos, flight)
 # names
 
 
+@pytest.mark.slow
 def test_names_with_spaces_accents_and_markup(mosaic, photos):
     strange = [
         "Überflug 1.jpg",

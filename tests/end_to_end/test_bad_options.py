@@ -316,6 +316,7 @@ def test_json_has_no_values_that_json_does_not_know(mosaic, photos):
         json.loads(text, parse_constant=lambda word: pytest.fail(word))
 
 
+@pytest.mark.slow
 def test_quiet_is_silent(mosaic, photos):
     for path in keep(photos, 0, 1, 2):
         relabel(path, strip=True)

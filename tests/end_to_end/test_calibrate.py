@@ -73,6 +73,7 @@ def test_a_taken_folder_is_left_alone(done, frames):
         calibrate(frames, frames, SETTINGS)
 
 
+@pytest.mark.slow
 def test_mixed_cameras_are_refused(tmp_path):
     write(tmp_path / "in", "a.tif", frame(frontal()))
     write(tmp_path / "in", "b.tif", frame(frontal())[:400, :500])

@@ -36,6 +36,7 @@ def worked(live, until):
     raise AssertionError("it did not happen")
 
 
+@pytest.mark.slow
 def test_a_block_that_grows_is_adjusted_while_photos_wait(live):
     worked(live, lambda: live.background.jobs)
     assert len(live.queues.untried) >= 2

@@ -116,6 +116,7 @@ def test_beyond_the_rim_it_fades_without_steps():
     assert (smooth_fill(array, np.ones_like(valid)) == array).all()
 
 
+@pytest.mark.slow
 @settings(
     max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )

@@ -135,6 +135,7 @@ def test_radiometric_resume_keeps_nan(tmp_path):
     assert path.read_bytes() == (tmp_path / "whole.tif").read_bytes()
 
 
+@pytest.mark.slow
 def test_threads(tmp_path):
     path = tmp_path / "a.tif"
     with CogWriter(path, SPEC, digest="x") as writer, ThreadPoolExecutor(8) as pool:
