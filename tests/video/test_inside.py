@@ -10,21 +10,18 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from pyproj import Transformer
 
-from skyquilt import simulate as sim
 from skyquilt.geometry.geoid import geoid_height
 from skyquilt.model.clip import Clip
-from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.clip_tracks import DataTrack, add_track, track_in_clip
-from skyquilt.simulate.settings import InClipLayout, Reporting, Route, Video
+from skyquilt.simulate.settings import InClipLayout
 from skyquilt.video.dji_frames import dji_fix
 from skyquilt.video.gopro import gopro_fixes
 from skyquilt.video.inside import track_inside
-from skyquilt.video.positions import places_at
 from skyquilt.video.read import read_clip
 from skyquilt.video.timed_data import data_tracks, read_data
 from tests.video.clips import filmed, flown, numbered, write_clip
+from tests.video.simulated import distances, prepared, times_of
 
 RECORDED = Path(__file__).parent / "recorded" / "subtitles.mp4"
 """16 frames with subtitles, as FFmpeg puts them together."""
@@ -33,20 +30,14 @@ RECORDED = Path(__file__).parent / "recorded" / "subtitles.mp4"
 @pytest.fixture(scope="module")
 def flight():
     """The settings of a flight with a video, and all that happens in it."""
-    settings = sim.FlightSettings(
-        lens=Lens().scaled(480, 360),
-        route=Route(photos=12, sidelap=0.4, speed=8.0),
-        reporting=Reporting(gps_noise=0.0, focal_error=0.0),
-        video=Video(fps=5.0, fixes_per_second=5.0, shift=2.0),
-    )
-    return settings, sim.prepare(settings)
+    return prepared()
 
 
 @pytest.mark.parametrize("layout", get_args(InClipLayout))
 def test_every_layout_in_a_clip_is_read_as_it_was_meant(flight, layout, tmp_path):
     settings, world = flight
     video, film = replace(settings.video, layout=layout), world.video
-    times = np.array([s.waypoint.time for s in film.shots])
+    times = times_of(world)
     path = write_clip(tmp_path / "A.MP4", numbered(8), fps=5.0)
     before = path.read_bytes()
     add_track(path, track_in_clip(film.reports, times, video, settings.weather.moment))
@@ -54,16 +45,9 @@ def test_every_layout_in_a_clip_is_read_as_it_was_meant(flight, layout, tmp_path
     assert isinstance(clip, Clip) and clip.frames == 8 and path.read_bytes() != before
     track = clip.track
     assert track.on_clip and track.file == "A.MP4 (telemetry)"
-    found = places_at(track, times + 2.0)
-    x, y = Transformer.from_crs(4326, world.place.crs, always_xy=True).transform(
-        found.longitude_deg, found.latitude_deg
-    )
-    true = np.array([s.centre for s in film.shots])
-    off = np.hypot(x - world.place.easting - true[:, 0], y - world.place.northing - true[:, 1])
-    inside = np.isfinite(off)
-    assert inside.mean() > 0.9
+    off = distances(track, world)
     # four decimals are 11 m, a third of that on average; the others have seven
-    assert np.median(off[inside]) < (4.0 if layout == "mini2" else 0.02)
+    assert np.median(off) < (4.0 if layout == "mini2" else 0.02)
     frame = np.round((track.height_time_s - 2) * 5).astype(int)
     high = track.sea_level_m if layout == "gopro" else track.takeoff_m
     told = [r.sea_level if layout == "gopro" else r.takeoff for r in film.reports]

@@ -17,6 +17,7 @@ from skyquilt.errors import OutputError
 from skyquilt.simulate.grid import Doubles
 from skyquilt.simulate.reported import Report
 from skyquilt.simulate.settings import Video
+from skyquilt.simulate.video import fixed_in
 
 _SCALE = 1000
 """Ticks per second."""
@@ -113,21 +114,14 @@ _EMPTY = {b"tx3g": bytes(2), b"gpmd": bytes(0), b"djmd": bytes(0)}
 """A sample that says nothing."""
 
 
-def _fixed(times: Doubles, video: Video) -> list[int]:
-    """The frame whose fix each frame repeats: receivers measure less often than cameras film."""
-    moments = np.floor(times * video.fixes_per_second + 1e-6) / video.fixes_per_second
-    frames = np.ceil(moments * video.fps - 1e-6).astype(int)
-    return [int(k) for k in np.minimum(frames, len(times) - 1)]
-
-
 def _subtitles(
     reports: Sequence[Report], times: Doubles, video: Video, start: datetime
 ) -> DataTrack:
     """DJI Mini 2: a line a second, with positions of four decimals, without a clock."""
-    samples, fixed = [], _fixed(times, video)
+    samples = []
     for second in np.arange(0.0, times[-1] + 1e-9):
         frame = min(round(second * video.fps), len(reports) - 1)
-        place, here = reports[fixed[frame]], reports[frame]
+        place, here = reports[fixed_in(times[frame], video, len(reports))], reports[frame]
         text = (
             f"F/2.8, SS 400.0, ISO 100, EV 0, GPS ({place.longitude or 0:.4f},"
             f" {place.latitude or 0:.4f}, 15), D 50.00m, H {here.takeoff or 0:.2f}m,"
@@ -141,9 +135,9 @@ def _messages(
     reports: Sequence[Report], times: Doubles, video: Video, start: datetime
 ) -> DataTrack:
     """DJI Mini 4 Pro: a message a frame, with places in radians and the gimbal's angles."""
-    samples, fixed = [], _fixed(times, video)
-    for number, here in enumerate(reports):
-        at = reports[fixed[number]]
+    samples = []
+    for number, (here, time) in enumerate(zip(reports, times, strict=True), 1):
+        at = reports[fixed_in(time, video, len(reports))]
         yaw, pitch, roll = here.gimbal or (0.0, -90.0, 0.0)
         place = _double(2, np.radians(at.latitude or 0)) + _double(3, np.radians(at.longitude or 0))
         drone = _message(
@@ -155,7 +149,7 @@ def _messages(
         gimbal = _message(
             3, *(_integer(k, round(10 * v)) for k, v in ((1, pitch), (2, roll), (3, yaw)))
         )
-        frame = _message(3, _message(1, _integer(1, number + 1)), drone, _message(4, gimbal))
+        frame = _message(3, _message(1, _integer(1, number)), drone, _message(4, gimbal))
         samples.append((1 / video.fps, frame))
     return DataTrack(form=b"djmd", handler=b"meta", samples=samples)
 
@@ -192,7 +186,7 @@ def _gopro(reports: Sequence[Report], times: Doubles, video: Video, start: datet
         moments = np.arange(second, second + length - 1e-6, each)
         rows = b""
         for moment in moments:
-            r = reports[min(int(np.ceil(moment * video.fps - 1e-6)), len(reports) - 1)]
+            r = reports[fixed_in(moment, video, len(reports))]
             place = (1e7 * (r.latitude or 0), 1e7 * (r.longitude or 0), 1e3 * (r.sea_level or 0))
             rows += struct.pack(">5i", *(round(v) for v in place), 5000, 500)
         clock = start + timedelta(seconds=float(second))

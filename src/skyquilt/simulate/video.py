@@ -188,15 +188,13 @@ def telemetry(
     Positions are measured `fixes_per_second` times a second only: between, the fix before is
     repeated, as receivers do.
     """
-    layout, rate = _LAYOUTS[video.layout], video.fixes_per_second
+    layout = _LAYOUTS[video.layout]
     focal = next((r.focal for r in reports if r.focal), None)
     mm = focal and focal * _DIAGONAL_35MM / float(np.hypot(lens.width, lens.height))
     rows, each = [], 1.0 if layout.per_second else 1 / video.fps
     shown = np.arange(0.0, times[-1] + 1e-9, each) if layout.per_second else times
     for number, at in enumerate(shown, 1):
-        fixed = np.floor(at * rate + 1e-6) / rate
-        # a fix is of the moment of the frame that shows it first
-        report = reports[min(int(np.ceil(fixed * video.fps - 1e-6)), len(reports) - 1)]
+        report = reports[fixed_in(float(at), video, len(reports))]
         index = min(round(at * video.fps), len(reports) - 1)
         here = reports[index]
         clock = start + timedelta(seconds=float(at - times[index]) + here.clock)
@@ -204,6 +202,14 @@ def telemetry(
         when = float(at) + video.shift
         rows.append(f"{number}\n{_span(when, when + each)}\n{body}\n")
     return "\n".join(rows) + "\n"
+
+
+def fixed_in(time: float, video: Video, frames: int) -> int:
+    """The frame, of so many, of the receiver's last fix at a time in s: receivers measure less
+    often than cameras film. A fix is of the moment of the frame that shows it first.
+    """
+    fixed = np.floor(time * video.fixes_per_second + 1e-6) / video.fixes_per_second
+    return min(int(np.ceil(fixed * video.fps - 1e-6)), frames - 1)
 
 
 def _span(a: float, b: float) -> str:
