@@ -1,5 +1,6 @@
 import re
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -7,6 +8,7 @@ import pytest
 from skyquilt.alignment.outcome import UNSETTLED
 from skyquilt.errors import OutputError
 from skyquilt.report import CameraResiduals, ReportInput, SeamMark, Shot, build_report, write_report
+from skyquilt.report.about import facts_of
 from skyquilt.report.attention import attention
 
 from .report_cases import Page, run, shots
@@ -50,6 +52,13 @@ def test_a_whole_run_fills_every_section():
         "feather",
     ):
         assert words in page.text, words
+
+
+def test_a_clip_that_does_not_tell_when_it_was_filmed_has_no_date():
+    told = [replace(s, time="2024-05-01T10:00:00") for s in shots(3)]
+    untold = [replace(s, time="1970-01-01T00:00:09") for s in shots(3)]
+    assert dict(facts_of(run(shots=tuple(told))))["Captured"] == "2024-05-01 10:00 to 10:00"
+    assert "Captured" not in dict(facts_of(run(shots=tuple(untold))))
 
 
 def test_links_inside_the_page_lead_somewhere():

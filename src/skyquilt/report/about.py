@@ -18,7 +18,8 @@ def facts_of(data: ReportInput) -> tuple[tuple[str, str], ...]:
 
 
 def _facts(data: ReportInput) -> Iterator[tuple[str, str]]:
-    times = sorted(s.time for s in data.shots if s.time)
+    # frames of a clip that does not tell when it was filmed count from the epoch
+    times = sorted(s.time for s in data.shots if s.time and not s.time.startswith("1970-"))
     if times:
         first, last = times[0], times[-1]
         day, until = first[:10], last[11:16] if last[:10] == first[:10] else last[:16]
