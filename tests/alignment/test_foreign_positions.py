@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from skyquilt.alignment.aligners import Auto, ByLinks, by_pose
+from skyquilt.alignment.crowded_positions import unplaced, without_places
 from skyquilt.alignment.far_sites import site_notes, with_site_notes
 from skyquilt.alignment.foreign_positions import without_foreign
 from skyquilt.model.photo import ControlPoint
@@ -41,6 +42,17 @@ def test_the_largest_block_is_not_placed_by_a_few_photos_of_another_place(seed):
     assert found.frame.crs is None and "not georeferenced" in found.why
     assert set(found.poses) == set(range(10)) and "its place is not known" in found.rejected[12]
     assert sum("10.jpg, 11.jpg" in note for note in found.notes) == 1
+
+
+def test_a_second_place_is_told_as_such_where_no_photo_has_metadata():
+    """It is not sought among the tie points of the largest block, with which it has none in
+    common."""
+    given = two_places(told=[])
+    bare = [replace(p, yaw_deg=np.nan, sigma_tilt_deg=6.0) for p in without_places(given.priors)]
+    found = aligned(replace(given, priors=bare, frame=unplaced(given.frame)))
+    assert set(found.poses) == set(range(10))
+    assert found.rejected.keys() == set(range(10, 14))
+    assert all("not with the 10 of the largest block" in w for w in found.rejected.values())
 
 
 def test_one_photo_without_links_places_no_block():

@@ -200,6 +200,10 @@ def test_observations_without_residuals_are_as_sharp_as_pictures_are_matched():
     assert told[0] < 0.007 * 160
 
 
+ONE = np.zeros(len(LAWN), int)
+"""Links connect all photos."""
+
+
 @pytest.mark.parametrize("pitch", [0.0, 45.0, 72.0])
 def test_resection_finds_the_pose_among_wrong_points(pitch):
     where, xyz = pose(3, -20, yaw=33, pitch=pitch, roll=4), hills(4000, wide=200)
@@ -230,19 +234,21 @@ def test_a_photo_that_fell_elsewhere_is_hung_on_the_others_again():
     done = block(LAWN, hills(3000))
     priors = [prior(p.map_C, yaw=0.0) for p in LAWN]
     lost = dict.fromkeys(done.held, 0.7)
-    assert found_oblique(done, {}, priors, lost) == frozenset()
+    assert found_oblique(done, {}, priors, lost, ONE) == frozenset()
     far = done.poses | {3: pose(-16, 41, z=77, pitch=20)}
-    assert found_oblique(replace(done, poses=far), {}, priors, lost) == {3}
+    assert found_oblique(replace(done, poses=far), {}, priors, lost, ONE) == {3}
     whole = dict.fromkeys(done.held, 0.9)  # position and angles are false: pictures agree
-    assert found_oblique(replace(done, poses=far), {}, priors, whole) == frozenset()
+    assert found_oblique(replace(done, poses=far), {}, priors, whole, ONE) == frozenset()
     near = done.poses | {3: pose(20, -30, pitch=20)}  # where it reports: its angles may be false
-    assert found_oblique(replace(done, poses=near), {}, priors, lost) == frozenset()
+    assert found_oblique(replace(done, poses=near), {}, priors, lost, ONE) == frozenset()
     level = done.poses | {3: pose(-16, 41, z=77)}  # its position may be false
-    assert found_oblique(replace(done, poses=level), {}, priors, lost) == frozenset()
+    assert found_oblique(replace(done, poses=level), {}, priors, lost, ONE) == frozenset()
     untold = [replace(p, sigma_tilt_deg=6.0) for p in priors]
-    assert found_oblique(replace(done, poses=far), {}, untold, lost) == frozenset()
+    assert found_oblique(replace(done, poses=far), {}, untold, lost, ONE) == frozenset()
     most = {i: pose(-16, 41, z=77, pitch=20) for i in range(9)}
-    assert found_oblique(replace(done, poses=done.poses | most), {}, priors, lost) == frozenset()
+    assert (
+        found_oblique(replace(done, poses=done.poses | most), {}, priors, lost, ONE) == frozenset()
+    )
 
 
 @pytest.mark.parametrize(
@@ -295,12 +301,12 @@ def test_photos_without_angles_lie_elsewhere_where_they_lost_their_matches():
     reported = [prior(p.map_C, yaw=0.0) for p in LAWN]
     untold = [replace(p, sigma_tilt_deg=6.0) for p in reported]
     aslant = replace(done, poses=done.poses | {3: pose(-16, 41, pitch=40)})
-    assert found_oblique(aslant, {}, untold, whole) == frozenset()
-    assert found_oblique(aslant, {}, untold, whole | {3: 0.7}) == {3}
-    assert found_oblique(done, {}, untold, whole | {3: 0.7}) == frozenset()
-    assert found_oblique(done, {}, untold, whole | {3: 0.5}) == {3}
-    assert found_oblique(done, {}, reported, whole | {3: 0.5}) == frozenset()
-    assert found_oblique(done, {}, untold, dict.fromkeys(whole, 0.5)) == frozenset()
+    assert found_oblique(aslant, {}, untold, whole, ONE) == frozenset()
+    assert found_oblique(aslant, {}, untold, whole | {3: 0.7}, ONE) == {3}
+    assert found_oblique(done, {}, untold, whole | {3: 0.7}, ONE) == frozenset()
+    assert found_oblique(done, {}, untold, whole | {3: 0.5}, ONE) == {3}
+    assert found_oblique(done, {}, reported, whole | {3: 0.5}, ONE) == frozenset()
+    assert found_oblique(done, {}, untold, dict.fromkeys(whole, 0.5), ONE) == frozenset()
 
 
 def test_the_dominant_plane_levels_the_map_whatever_stands_on_it():

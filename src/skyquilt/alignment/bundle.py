@@ -35,7 +35,7 @@ from skyquilt.alignment.setup import Setup, camera_records, pose_records, priors
 from skyquilt.alignment.stages import fine_steps, plain, rough_steps, settled, weighed
 from skyquilt.alignment.start import Start, find_start, focals_by_heights, ground_of, with_focals
 from skyquilt.alignment.told_poses import believe_told
-from skyquilt.alignment.tracks import Thinning, Tracks, build_tracks, thin
+from skyquilt.alignment.tracks import Thinning, Tracks, blocks_of, build_tracks, thin
 from skyquilt.alignment.triangulate import triangulated
 from skyquilt.alignment.tries import Beginning, Survey, Tried
 from skyquilt.alignment.unfit_cameras import (
@@ -91,7 +91,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 88
+    version: ClassVar[int] = 89
 
     def __call__(
         self,
@@ -159,11 +159,12 @@ class Bundle:
         if lowered(found, begun.priors) is not begun.priors:
             notes += (LOWERED,)
         weak = weak_photos(found, begun.priors)
+        part = blocks_of(len(photos), links)
         all_told = all(p.sigma_tilt_deg <= STATED_DEG for p in begun.priors)
         for again in range(ASIDE_AGAIN if self.repair else 0):
             asked = not all_told or contradicting(found, begun.priors)
             kept = kept_matches(found, features, links) if asked else {}
-            more = found_oblique(found, weak, begun.priors, kept) - begun.aside
+            more = found_oblique(found, weak, begun.priors, kept, part) - begun.aside
             begun = replace(begun, aside=begun.aside | more)
             if not more or (again and more <= found.rejected.keys() | weak.keys()):
                 break  # those bend the block no more
@@ -346,7 +347,8 @@ def _nowhere(start: Start) -> dict[int, str]:
     of = "the largest block" if known[0] == blocks[0] else "those that positions place"
     return {
         i: f"it is linked with {len(block) - 1} other photos, but not with the {len(known[0])} of"
-        f" {of}, and without a usable position its place is not known"
+        f" {of}, and without a usable position its place is not known; map these"
+        " by themselves"
         for block in lost
         for i in block
     }

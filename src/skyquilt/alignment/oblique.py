@@ -8,6 +8,7 @@ all others (Fischler and Bolles 1981), refined by least squares, the block held.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -126,12 +127,15 @@ def found_oblique(
     weak: Mapping[int, str],
     priors: Sequence[Prior],
     kept: Mapping[int, float],
+    part: NDArray[np.integer[Any]],
 ) -> frozenset[int]:
     """Photos without reported tilt that the adjustment turned far from the vertical with a loss of
     matches, that lost many, or that it could not hold; besides, those that it turned and moved far
     from what they report with such a loss: without one, they report falsely. None if most are.
     `weak`: those that are not determined; `kept`: shares of the held photos' matches
-    (`kept_matches`), not needed where all report their tilt and none is moved so.
+    (`kept_matches`), not needed where all report their tilt and none is moved so; `part`: numbers
+    of the parts (per photo) that links connect, of which one without held photos has nothing that
+    it could be placed by.
     """
     linked = [*alignment.held, *alignment.rejected]
     found = {i for i in kept if kept[i] < FEW_KEPT}
@@ -141,6 +145,7 @@ def found_oblique(
         if kept[i] < MOST_KEPT and tilt_deg(alignment.poses[i].cam_R_map) > OBLIQUE_DEG
     }
     found |= alignment.rejected.keys() | weak.keys()
+    found &= set(np.flatnonzero(np.isin(part, part[list(alignment.held)])).tolist())
     guessed = {i for i in found if priors[i].sigma_tilt_deg > STATED_DEG}
     guessed |= {i for i in contradicting(alignment, priors) if kept[i] < MOST_KEPT}
     return frozenset(guessed if len(guessed) <= MOST_OBLIQUE * len(linked) else ())
