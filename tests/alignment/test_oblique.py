@@ -1,6 +1,7 @@
 """Weak and oblique photos, resection and levelling, on points with known poses."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -121,6 +122,23 @@ def test_a_photo_held_by_a_small_corner_is_named_with_figures():
     assert "% of its picture" in found[14]
     told = [prior((np.nan,) * 3)] * 14 + [prior((40, 30, 60.0), sigma=0.1, sigma_z=0.1)]
     assert weak_photos(block(LAWN, hills(6000), shows=corner), told) == {}
+
+
+@pytest.mark.parametrize(
+    ("roll_deg", "position", "weak"), [(0.0, True, False), (0.0, False, True), (15.0, True, True)]
+)
+def test_a_photo_without_angles_hangs_on_few_points_where_nothing_else_explains_them(
+    roll_deg, position, weak
+):
+    """Points over 6 % of a picture hold a photo that looks straight down from where it says it is;
+    they may show another direction where it has no position, or is found to be tilted."""
+    band = {14: lambda px, xyz: px[:, 1] < 52}
+    lawn = [*LAWN[:14], pose(40, 30, roll=roll_deg)]
+    untold = [replace(prior(p.map_C), yaw_deg=np.nan, sigma_tilt_deg=6.0) for p in LAWN]
+    if not position:
+        untold = [replace(p, map_C=np.full(3, np.nan)) for p in untold]
+    found = weak_photos(block(lawn, hills(20000), shows=band), untold)
+    assert list(found) == [14] * weak and all("8% are needed" in why for why in found.values())
 
 
 def test_photos_that_only_hold_each_other_are_weak_together():
@@ -292,6 +310,14 @@ def test_tie_points_do_not_put_an_oblique_photo_far_from_all_that_it_reports(
             "its tie points would put it 40 m from its position and turn it by 25 degrees from"
             " what it reports"
         )
+
+
+def test_a_photo_without_tie_points_in_common_is_told_as_such():
+    done = block(LAWN, hills(300))
+    photos = [SimpleNamespace(camera_key="c", lens=CAMERA)] * 16
+    features = [SimpleNamespace(px=np.zeros((0, 2)), scale=1.0)] * 16
+    found = hung(done, {}, photos, [NOTHING] * 16, features, [], frozenset({15}))
+    assert found.rejected == {15: "no tie point connects it with photos that are placed"}
 
 
 def test_photos_without_angles_lie_elsewhere_where_they_lost_their_matches():

@@ -28,8 +28,11 @@ chance.
 """
 LEAST_UNTOLD = 0.08
 """The same for photos that do not report their tilt: a small piece of level ground looks the same
-from two directions, and deviations say nothing of the other one.
+from two directions, and deviations say nothing of the other one. Both are nearly the same for a
+photo that is found to look straight down, and one that lies elsewhere contradicts its position.
 """
+LEVEL = np.cos(np.radians(10.0))
+"""Photos that look straight down to within this (cosine of the tilt)."""
 STATED_DEG = 5.0
 """Tilts with a larger standard deviation than this are guesses, not reports."""
 FEWEST_PLACED, EXTENDED, AGREEING = 5, 6.0, 2.5
@@ -210,13 +213,18 @@ class _Growth:
             ties.px[own],
             ties.residual_px[own],
             self.priors[photo],
-            least=least_covered(self.priors[photo]),
+            least=least_covered(self.priors[photo], self.alignment.poses[photo]),
         )
 
 
-def least_covered(prior: Prior) -> float:
-    """Least share of a photo's picture that its tie points cover."""
-    return LEAST_COVERED if prior.sigma_tilt_deg <= STATED_DEG else LEAST_UNTOLD
+def least_covered(prior: Prior, pose: Pose) -> float:
+    """Least share of a photo's picture that its tie points cover, by its metadata and by where it
+    is found to be.
+    """
+    if prior.sigma_tilt_deg <= STATED_DEG:
+        return LEAST_COVERED
+    level = -pose.cam_R_map[2, 2] > LEVEL
+    return LEAST_COVERED if level and np.isfinite(prior.map_C[:2]).all() else LEAST_UNTOLD
 
 
 def why_weak(

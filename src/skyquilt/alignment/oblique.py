@@ -258,6 +258,9 @@ def _placed(
     scale: float,
 ) -> Alignment:
     """The alignment with one more photo, or with the reason why it is left out."""
+    if not len(point):
+        why = "no tie point connects it with photos that are placed"
+        return replace(alignment, rejected=alignment.rejected | {photo: why})
     camera = alignment.cameras.get(about.camera_key, about.lens)
     xyz = alignment.ties.xyz[point]
     pose, good = resected(camera, xyz, px, AGREE_PX * scale)
@@ -268,7 +271,7 @@ def _placed(
         )
         return replace(alignment, rejected=alignment.rejected | {photo: why})
     error = project(camera, pose.to_camera(xyz)) - px
-    least = least_covered(prior)
+    least = least_covered(prior, pose)
     why = why_weak(pose, camera, xyz[good], px[good], error[good], None, least=least)
     why = why or _why_elsewhere(pose, prior, alignment.ground_m)
     if why:
