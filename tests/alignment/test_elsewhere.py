@@ -109,10 +109,23 @@ def test_nothing_is_told_of_cameras_whose_photos_were_all_left_out(block):
     )
     assert len(notes) == 21
     found = replace(found, notes=notes)
-    assert outcome.of_placed(found) is found
-    left = outcome.of_placed(without_photos(found, {1: "a screenshot"}))
+    assert outcome.without_idle(found) is found
+    left = outcome.without_idle(without_photos(found, {1: "a screenshot"}))
     assert left.notes == notes[:14]
     assert left.accuracy.focal_share == 0.2 and found.accuracy.focal_share == 0.9
+
+
+def test_many_cameras_of_undetermined_focal_length_are_told_in_one_sentence(block):
+    """The one told first is the least certain; other notes stay where they are."""
+    _, found = block
+    (own,) = set(found.camera_of.values())
+    keys = ("a: 1", "a", "b")
+    told = [f"{outcome.UNSETTLED} of {key}: it stays uncertain." for key in keys]
+    found = replace(found, cameras=dict.fromkeys(keys, found.cameras[own]))
+    one = replace(found, notes=("before", told[0], "after"))
+    assert outcome.told_once(one) is one
+    several = outcome.told_once(replace(found, notes=("before", *told, "after")))
+    assert several.notes == ("before", f"{told[0]} The same is true of 2 more: a, b.", "after")
 
 
 def test_the_accuracy_is_not_that_of_points_too_uncertain_for_the_ground(block):

@@ -14,6 +14,7 @@ from skyquilt.alignment.tracks import Tracks
 from skyquilt.alignment.triangulate import STEADY_HIGH, polish, triangulated
 from skyquilt.model.camera import PARAMETERS
 from skyquilt.model.poses import Accuracy, Alignment, TiePoints, no_ties
+from skyquilt.photos.side_rows import sentence_of
 
 Array = NDArray[np.float64]
 SAMPLED = 400
@@ -183,23 +184,24 @@ def _focal_shares(setup: Setup, problem: Problem, covariance: Covariance) -> dic
 def undetermined(
     setup: Setup, problem: Problem, state: State, covariance: Covariance | None
 ) -> tuple[str, ...]:
-    """Sentences about what the flight does not determine."""
+    """Sentences about what the flight does not determine, on the least certain camera first."""
     if covariance is None:
         return ()
-    notes = []
+    notes = list[tuple[float, str]]()
     height = float(np.median(heights_above(state)))
     after = covariance.camera_sigmas[:, 0]
     for row, key in enumerate(setup.camera_keys):
         share = float(after[row] / state.K[row, 0])
         told = float(problem.sigma_K[row, 0] / state.K[row, 0])
         if problem.free[row, 0] and share > UNDETERMINED * told and share * height > 0.01:
-            notes.append(
+            note = (
                 f"{UNSETTLED} of {key}: it stays about as"
                 f" uncertain as its metadata ({100 * share:.1f} %), and heights of the ground with"
                 f" it ({share * height:.2g} m, one standard deviation); control points, oblique"
                 " photos or lines at two heights would."
             )
-    return tuple(notes)
+            notes.append((-share, note))
+    return tuple(note for _, note in sorted(notes))
 
 
 def unconfirmed(setup: Setup, problem: Problem) -> tuple[str, ...]:
@@ -252,6 +254,30 @@ def misfits(setup: Setup, problem: Problem, state: State) -> tuple[str, ...]:
 
 
 def of_placed(found: Alignment) -> Alignment:
+    """The alignment with what is told of cameras that placed photos were taken with, once."""
+    return told_once(without_idle(found))
+
+
+def told_once(found: Alignment) -> Alignment:
+    """The alignment with one sentence on all cameras whose focal length is not determined: on the
+    least certain one, and the names of the others. Photos of a lens that zooms are of many cameras.
+    """
+    camera = {
+        note: key
+        for note in found.notes
+        for key in found.cameras
+        if note.startswith(f"{UNSETTLED} of {key}: ")
+    }
+    if len(camera) < 2:
+        return found
+    first, *others = camera
+    names = sentence_of([camera[note] for note in others])
+    whole = f"{first} The same is true of {len(others)} more: {names}."
+    notes = (whole if note == first else note for note in found.notes if note not in others)
+    return replace(found, notes=tuple(notes))
+
+
+def without_idle(found: Alignment) -> Alignment:
     """The alignment without what is told of cameras that no placed photo was taken with: those of
     screenshots, copies and photos of other places that were left out.
     """
