@@ -54,14 +54,14 @@ def one_of(option: str, value: str, allowed: Iterable[str]) -> None:
         raise UsageError(f"{option} {value!r} is not one of {', '.join(allowed)}")
 
 
-def within(option: str, value: float | None, low: float, high: float) -> None:
+def within(option: str, value: float | None, low: float, high: float, unit: str = "") -> None:
     """Refuses a number outside its limits; None passes.
 
     Raises:
-        UsageError: it lies outside.
+        UsageError: it lies outside; the sentence tells the unit.
     """
     if value is not None and not low <= value <= high:
-        raise UsageError(f"{option} {value} lies outside {low} to {high}")
+        raise UsageError(f"{option} {value} lies outside {low} to {high} {unit}".rstrip())
 
 
 def check_shutter(shutter: str | None, readout_ms: float | None) -> None:
@@ -143,14 +143,14 @@ class InputSettings:
 
     def __post_init__(self) -> None:
         typed(self)
-        within("--max-mp", self.max_mp, 0.01, 10_000)
+        within("--max-mp", self.max_mp, 0.01, 10_000, "megapixels")
         if self.thermal_unit is not None:
             one_of("--thermal-unit", self.thermal_unit, THERMAL_UNITS)
         check_shutter(self.shutter, self.shutter_readout_ms)
-        within("--frame-overlap", self.frame_overlap, 30, 95)
-        within("--clock-offset", self.clock_offset, -1e8, 1e8)
+        within("--frame-overlap", self.frame_overlap, 30, 95, "percent")
+        within("--clock-offset", self.clock_offset, -1e8, 1e8, "s")
         for value in self.lever_arm or ():
-            within("--lever-arm", value, -20, 20)
+            within("--lever-arm", value, -20, 20, "m")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,8 +202,8 @@ class CameraSettings:
         typed(self)
         if self.distortion is not None:
             one_of("--distortion", self.distortion, DISTORTIONS)
-        within("--height", self.height_m, 0.5, 1e5)
-        within("--heading", self.heading_deg, -360, 360)
+        within("--height", self.height_m, 0.5, 1e5, "m")
+        within("--heading", self.heading_deg, -360, 360, "degrees")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -252,9 +252,9 @@ class PictureSettings:
         one_of("--blend", self.blend, ("auto", *BLENDS))
         if self.vertical_datum is not None:
             one_of("--vertical-datum", self.vertical_datum, VERTICAL_DATUMS)
-        within("--gsd", self.gsd_cm, 0.05, 10000)
-        within("--feather", self.feather_px, 0, 10000)
-        within("--max-view-angle", self.max_view_angle, 1, 90)
+        within("--gsd", self.gsd_cm, 0.05, 10000, "cm")
+        within("--feather", self.feather_px, 0, 10000, "px")
+        within("--max-view-angle", self.max_view_angle, 1, 90, "degrees")
         b = self.bounds
         if b and not (all(isfinite(v) for v in b) and b[0] < b[2] and b[1] < b[3]):
             raise UsageError(
@@ -279,7 +279,7 @@ class OutputSettings:
         typed(self)
         one_of("--compress", self.compress, COMPRESSIONS)
         within("--quality", self.quality, 1, 100)
-        within("--contours", self.contours_m, 0.05, 1000)
+        within("--contours", self.contours_m, 0.05, 1000, "m")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -306,7 +306,7 @@ class RunningSettings:
     def __post_init__(self) -> None:
         typed(self)
         within("--jobs", self.jobs, 0, 1024)
-        within("--memory", self.memory_gb, 0.5, 4096)
+        within("--memory", self.memory_gb, 0.5, 4096, "GB")
         within("--seed", self.seed, 0, 2**32 - 1)
         _check_scheduler(self.scheduler)
 
@@ -327,7 +327,7 @@ class ImageSettings:
     def __post_init__(self) -> None:
         typed(self)
         one_of("--image-search", self.image_search, IMAGE_SEARCHES)
-        within("--relief", self.relief_m, 0, 1e4)
+        within("--relief", self.relief_m, 0, 1e4, "m")
 
 
 @dataclass(frozen=True, kw_only=True)

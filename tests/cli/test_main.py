@@ -130,7 +130,7 @@ def run(monkeypatch, *words):
     [
         (["--method", "magic"], 2, "auto, bundle, position, pose"),
         (["--blend", "magic"], 2, "feather, first, average, multiband"),
-        (["--gsd", "0"], 2, "--gsd 0.0 lies outside"),
+        (["--gsd", "0"], 2, "--gsd 0.0 lies outside 0.05 to 10000 cm"),
         (["--bounds", "1,2,3"], 2, "four numbers"),
         (["--bounds", "5,0,1,9"], 2, "west < east"),
         (["--rerun-from", "lunch"], 2, "features, links, align"),
@@ -419,3 +419,12 @@ def test_a_bug_keeps_its_traceback(monkeypatch):
     monkeypatch.setattr("skyquilt.cli.app.app", fails)
     with pytest.raises(RuntimeError, match="a bug"):
         main.run()
+
+
+def test_photos_in_place_of_a_command_are_told_what_maps_them(tmp_path):
+    """A word that is neither a command nor a path is answered as before."""
+    invoke = CliRunner().invoke
+    told = invoke(commands.app, [str(tmp_path)]).exception
+    assert isinstance(told, errors.UsageError) and f"skyquilt mosaic {tmp_path} -o OUT" in str(told)
+    assert invoke(commands.app, [str(tmp_path / "none")]).exit_code == 2
+    assert invoke(commands.app, ["mosaic", "--help"]).exit_code == 0

@@ -1,8 +1,10 @@
 """The commands, one file each."""
 
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from skyquilt.cli import calibrate as calibrate_command
 from skyquilt.cli import compare as compare_command
@@ -19,6 +21,7 @@ from skyquilt.cli import spectral_bench as spectral_bench_command
 from skyquilt.cli import strip_test as strip_test_command
 from skyquilt.cli import view as view_command
 from skyquilt.cli.idle import Checked
+from skyquilt.errors import UsageError
 from skyquilt.version import __version__
 
 EXIT_CODES = (
@@ -27,7 +30,25 @@ EXIT_CODES = (
     " 5 output cannot be written, 6 malformed side file, 7 refused with a reason, 130 interrupted."
 )
 
-app = typer.Typer(no_args_is_help=True, add_completion=True, pretty_exceptions_enable=False)
+
+class Commands(TyperGroup):
+    """The commands; photos in place of one are told what maps them."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
+        """The command that the first word names, as the base class has it.
+
+        Raises:
+            UsageError: the word is no command, but a path that exists.
+        """
+        word = args[0]
+        if self.get_command(ctx, word) is None and Path(word).exists():
+            raise UsageError(f"{word} is no command; to map photos: skyquilt mosaic {word} -o OUT")
+        return super().resolve_command(ctx, args)
+
+
+app = typer.Typer(
+    cls=Commands, no_args_is_help=True, add_completion=True, pretty_exceptions_enable=False
+)
 app.command("mosaic", cls=Checked, epilog=EXIT_CODES)(mosaic_command.command)
 app.command("compare", cls=Checked, epilog=EXIT_CODES)(compare_command.command)
 app.command("export", cls=Checked, epilog=EXIT_CODES)(export_command.command)

@@ -177,7 +177,7 @@ def command(
     from skyquilt.photos.survey import read_survey
     from skyquilt.settings import within
 
-    within("--max-mp", max_mp, 0.01, 10_000)
+    within("--max-mp", max_mp, 0.01, 10_000, "megapixels")
     survey = read_survey(source_of(photos), geo=geo, cameras=cameras, max_mp=max_mp, clips=True)
     findings = contradictions(survey.photos)
     if json:

@@ -154,9 +154,9 @@ def command(
         from skyquilt.server.server_process import ServerConfig, ServerProcess
         from skyquilt.settings import within
     mode = mode_of(quiet=quiet, json=json)
-    within("--max-mb", max_mb, 0.01, 1e5)
-    within("--max-clip-mb", max_clip_mb, 0.01, 1e6)
-    within("--viewer-memory", viewer_memory, *MEMORY_GB)
+    within("--max-mb", max_mb, 0.01, 1e5, "MB")
+    within("--max-clip-mb", max_clip_mb, 0.01, 1e6, "MB")
+    within("--viewer-memory", viewer_memory, *MEMORY_GB, "GB")
     settings = LiveSettings(
         gsd_cm=gsd,
         crs=crs,

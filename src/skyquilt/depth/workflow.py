@@ -94,7 +94,7 @@ def iter_depth(
     output = as_path("output", output)
     if route not in ROUTES:
         raise UsageError(f"--route {route!r} is not one of {', '.join(ROUTES)}")
-    within("--relief", relief_m, 0, 10_000)
+    within("--relief", relief_m, 0, 10_000, "m")
     given = read_input(photos, settings.input)
     if not given.survey.clips:
         _enough(given)

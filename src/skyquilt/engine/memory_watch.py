@@ -59,7 +59,7 @@ def limit_bytes(asked_gb: float | None) -> int:
     Raises:
         UsageError: no machine has what is asked, or no run can do with it.
     """
-    within("--max-memory", asked_gb, *MEMORY_GB)
+    within("--max-memory", asked_gb, *MEMORY_GB, "GB")
     return int(asked_gb * 1e9) if asked_gb is not None else int(SHARE * machine_bytes())
 
 

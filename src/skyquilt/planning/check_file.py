@@ -35,8 +35,8 @@ def check_file(
     """
     path = Path(path)
     within("--views", views, 1, 200)
-    within("--width", width_m, 0.1, 100_000)
-    within("--clearance", clearance, 0, 1000)
+    within("--width", width_m, 0.1, 100_000, "m")
+    within("--clearance", clearance, 0, 1000, "m")
     if path.suffix.lower() == ".json":
         plan = read_plan(path)
         if terrain is None and plan.terrain:
