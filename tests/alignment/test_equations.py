@@ -1,5 +1,7 @@
 """Points eliminated part by part, against dense algebra."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -15,7 +17,7 @@ from skyquilt.alignment.eliminated_points import (
     polish_points,
 )
 from skyquilt.alignment.equations import Equations, NearFactor
-from skyquilt.alignment.problem import CAMERA, linearise
+from skyquilt.alignment.problem import CAMERA, InCommon, linearise
 from skyquilt.alignment.robust import observation_weights, prior_terms, robust_cost
 from skyquilt.engine.kept import Keep
 from skyquilt.engine.workers import HERE, Threads
@@ -57,11 +59,18 @@ def test_a_point_that_is_not_determined():
         points_inverse(-np.eye(3)[None], 0.0)
 
 
-@pytest.mark.parametrize("options", [{}, {"cameras": 2, "lies": 0.05}])
-def test_the_step_of_all_unknowns_solves_the_whole_equations(options):
-    """Those of photos, cameras and points, without elimination."""
+@pytest.mark.parametrize(
+    ("options", "common"),
+    [({}, False), ({"cameras": 2, "lies": 0.05}, False), ({"cameras": 2}, True)],
+)
+def test_the_step_of_all_unknowns_solves_the_whole_equations(options, common):
+    """Those of photos, cameras and points, without elimination; also where cameras have something
+    in common."""
     block, damping = make_block(0, points=80, **options), 1e-3
     problem, state = block.problem, block.start
+    if common:
+        rows = np.random.default_rng(0).normal(0, 30, (4, state.K.size))
+        problem = replace(problem, common=InCommon(rows=rows, zero=rows @ state.K.ravel() + 9.0))
     photos, cameras = Equations(problem, state).step(state, damping)
     points = points_step(problem, state, damping, photos, cameras)
     lin = linearise(problem, state)
@@ -85,6 +94,8 @@ def test_the_step_of_all_unknowns_solves_the_whole_equations(options):
     g[: 6 * n] += priors.photo_gradient[:, :6].ravel()
     g[6 * n : 6 * n + CAMERA * m] += priors.camera_gradient.ravel()
     H[np.diag_indices(len(H))] *= 1 + damping
+    if common:
+        H[np.ix_(own, own)] += priors.common.reshape(len(own), len(own))
     found = np.concatenate([photos.ravel(), cameras.ravel(), points.ravel()])
     assert np.abs(found).max() > 0.1
     off = np.abs(H @ found + g) / np.sqrt(np.diag(H) * float(g @ np.linalg.solve(H, g)))

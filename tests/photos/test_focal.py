@@ -238,6 +238,7 @@ def test_digital_zoom_lengthens_the_lens(make_jpeg):
     )
     assert photo.focal.px == pytest.approx(2 * 3.61 / 6.25 * 96)
     assert any("digital zoom of 2" in n for n in photo.notes)
+    assert photo.zoom.factor == 2 and photo.camera_key == f"{photo.zoom.camera} zoom 2"
 
 
 def test_photos_with_and_without_digital_zoom_have_intrinsics_of_their_own(make_jpeg):

@@ -9,7 +9,7 @@ from itertools import combinations, pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.model.photo import Photo
+from skyquilt.model.photo import Photo, Zoom
 from skyquilt.model.poses import Alignment, Prior
 
 FEWEST = 3
@@ -85,13 +85,15 @@ def as_enlarged(photos: Sequence[Photo], factors: Mapping[int, float]) -> list[P
     """The photos, those that are enlarged as of a camera of their own."""
     out = list(photos)
     for i, factor in factors.items():
-        focal = photos[i].focal
+        focal, before = photos[i].focal, photos[i].zoom
+        known = before or Zoom(camera=photos[i].camera_key, factor=1.0)
         px = focal.px * factor
         sigma = float(np.hypot(focal.sigma_px * factor, SIGMA * px))
         out[i] = replace(
             photos[i],
             camera_key=f"{photos[i].camera_key} {NAMED} {factor:.2f}",
             focal=replace(focal, px=px, sigma_px=sigma),
+            zoom=replace(known, factor=known.factor * factor, sigma=SIGMA),
             calibration=None,
             shown_lens=None,
         )

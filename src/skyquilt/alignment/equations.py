@@ -236,6 +236,8 @@ class Equations:
         out.blocks[pat.find(own, own)] += U
         for j in range(m if q else 0):
             out.corner[q * j : q * j + q, q * j : q * j + q] += Uc[j]
+        if q and priors.common is not None:
+            out.corner[: q * m, : q * m] += priors.common[:, :q, :, :q].reshape(q * m, q * m)
         if self.problem.offset:
             self._share_shift(out, state)
         return out, np.concatenate([g.ravel(), gc])

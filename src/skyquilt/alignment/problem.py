@@ -69,6 +69,18 @@ class State:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class InCommon:
+    """What intrinsics of several cameras have in common: linear combinations that are zero."""
+
+    rows: Array
+    """(r, 11 m) factors of the intrinsics of all cameras, one after the other, over the deviation
+    of their sum.
+    """
+    zero: Array
+    """(r,) what the sums are expected to be, over that deviation."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Problem:
     """Observations and priors. Observations are sorted by point. Of large surveys they fill the
     memory: their numbers are of 32 bits, and those of `parts` of 64.
@@ -90,6 +102,8 @@ class Problem:
     """(m, 11) prior of the intrinsics and the readout time."""
     sigma_K: Array
     """(m, 11) deviations of that prior."""
+    common: InCommon | None = None
+    """What cameras have in common that are one lens; None = each is its own."""
     C0: Array
     """(n, 3) measured centres; NaN where unknown."""
     sigma_C: Array

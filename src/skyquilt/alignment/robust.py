@@ -52,6 +52,8 @@ class PriorTerms:
     """(m, 11), zero where fixed."""
     camera_gradient: Array
     """(m, 11)."""
+    common: Array | None
+    """(m, 11, m, 11) precisions of what cameras have in common, or None."""
     cost: float
     """Their robust cost."""
 
@@ -65,6 +67,13 @@ def prior_terms(problem: Problem, state: State) -> PriorTerms:
     if problem.sigma_turn is not None:
         pt += 1 / problem.sigma_turn[:, None] ** 2
     cost = cost_c.sum() + cost_r.sum() + (pk * dk**2).sum() + (pt * state.turn**2).sum()
+    pull, common = pk * dk, None
+    if problem.common is not None:
+        off = problem.common.rows @ state.K.ravel() - problem.common.zero
+        rows = problem.common.rows * problem.free.ravel()
+        cost += off @ off
+        pull = pull + (off @ rows).reshape(state.K.shape)
+        common = (rows.T @ rows).reshape(*state.K.shape, *state.K.shape)
     R0, R0_T = problem.R0, np.swapaxes(problem.R0, 1, 2)
     photo = np.zeros((len(pr), 9, 9))
     photo[:, :3, :3] = (R0 * pr[:, None]) @ R0_T
@@ -74,7 +83,8 @@ def prior_terms(problem: Problem, state: State) -> PriorTerms:
         photo=photo,
         photo_gradient=np.concatenate([turning, pc * dc, pt * state.turn], 1),
         camera=pk,
-        camera_gradient=pk * dk,
+        camera_gradient=pull,
+        common=common,
         cost=float(cost),
     )
 

@@ -9,13 +9,14 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.motion import velocities
 from skyquilt.alignment.problem import PART, READOUT, Problem, State
+from skyquilt.alignment.same_lens import same_lens
 from skyquilt.alignment.start import GROSS_DEG, UNKNOWN_YAW_DEG, Start, steered
 from skyquilt.alignment.tracks import Tracks
 from skyquilt.alignment.triangulate import intersect
 from skyquilt.geometry.camera import tangent_over_angle
 from skyquilt.geometry.frames import angle_difference_deg, cam_R_map_from_angles
 from skyquilt.model.camera import PARAMETERS, Camera, order_named
-from skyquilt.model.photo import Photo
+from skyquilt.model.photo import Photo, Zoom
 from skyquilt.model.poses import Motion, Pose, Prior
 
 Array = NDArray[np.float64]
@@ -208,6 +209,8 @@ def set_up(
     if start.in_space:
         start_R = R0.copy()
     K0, sigma_K, free = intrinsic_priors([photos[m] for m in first], distortion)
+    zooms = [photos[m].zoom or Zoom(camera=photos[m].camera_key, factor=1.0) for m in first]
+    size = np.array([(p.width, p.height) for p in photos], float)
     base = Problem(
         point=np.zeros(0, np.int64),
         photo=np.zeros(0, np.int64),
@@ -217,6 +220,7 @@ def set_up(
         free=free,
         K0=K0,
         sigma_K=sigma_K,
+        common=same_lens(zooms, K0, size[first], free),
         C0=C0,
         sigma_C=sigma_C,
         R0=R0,
@@ -234,7 +238,7 @@ def set_up(
         camera=camera,
         camera_keys=keys,
         turned=turned,
-        size=np.array([(p.width, p.height) for p in photos], float),
+        size=size,
         stated_sigma_C=stated,
         block_rows=tuple(np.searchsorted(members, b) for b in start.blocks),
         z_ground=z_ground,

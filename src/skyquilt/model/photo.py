@@ -104,6 +104,18 @@ class Focal:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Zoom:
+    """A digital zoom: the middle of a camera's picture, enlarged to the size of the whole."""
+
+    camera: str
+    """`Photo.camera_key` of the camera without it."""
+    factor: float
+    """How many times as large the ground looks."""
+    sigma: float = 0.0
+    """Standard deviation of the factor, as a share of it."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Shutter:
     """How long a camera takes to read a photo out, row by row."""
 
@@ -176,6 +188,8 @@ class Photo:
     """Faults of its detector, mended when its pixels are read; None where none are known."""
     camera_key: str
     """Photos with equal keys share their intrinsics: make, model, serial, lens, size, zoom."""
+    zoom: Zoom | None = None
+    """Its digital zoom; None where it has none."""
     calibration: Camera | None = None
     """Intrinsics that metadata or a side file give, distortion included."""
     shown_lens: Camera | None = None

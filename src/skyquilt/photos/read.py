@@ -13,7 +13,7 @@ import numpy as np
 from skyquilt.engine.store import Store, digest
 from skyquilt.errors import UnreadablePhotoError
 from skyquilt.model.camera import Camera
-from skyquilt.model.photo import Focal, Photo, RejectedPhoto, Stored
+from skyquilt.model.photo import Focal, Photo, RejectedPhoto, Stored, Zoom
 from skyquilt.outside import MOST_MP, check_picture, open_regular, plain, whole
 from skyquilt.photos import tags as tag
 from skyquilt.photos.capture import Native, native_picture, part_of_shutter
@@ -212,7 +212,8 @@ def _photo(path: Path, name: str, header: Header, thermal_unit: str | None) -> P
         band="thermal" if lens.thermal else "visible",
         unit=frame.unit if frame else "",
         stored=frame.stored if frame else "",
-        camera_key=_camera_key(header, width, height),
+        camera_key=_camera_key(header, width, height, digital_zoom(header.exif)),
+        zoom=_zoom(header, width, height),
         calibration=lens.calibration,
         band_name=tag.band_shown(header.xmp),
         unusable_calibration=" and ".join(lens.nonsense),
@@ -341,9 +342,9 @@ def _says_thermal(header: Header) -> bool:
     return not large and ("lwir" in told or infrared)
 
 
-def _camera_key(header: Header, width: int, height: int) -> str:
+def _camera_key(header: Header, width: int, height: int, zoom: float) -> str:
     exif, xmp = header.exif, header.xmp
-    mm, zoom = exif.number(tag.FOCAL_MM), digital_zoom(exif)
+    mm = exif.number(tag.FOCAL_MM)
     make, model = exif.text(tag.MAKE) or "unknown", exif.text(tag.MODEL) or "camera"
     parts = (
         "" if model.lower().startswith(make.lower()) else make,
@@ -356,6 +357,11 @@ def _camera_key(header: Header, width: int, height: int) -> str:
         f"zoom {zoom:g}" if zoom > 1 else "",
     )
     return " ".join(" ".join(p.lower().split()) for p in parts if p)
+
+
+def _zoom(header: Header, width: int, height: int) -> Zoom | None:
+    factor = digital_zoom(header.exif)
+    return Zoom(camera=_camera_key(header, width, height, 1), factor=factor) if factor > 1 else None
 
 
 def _rolling(header: Header, sensor: Sensor | None) -> bool | None:
