@@ -38,6 +38,11 @@ def test_a_photo_that_came_later_joins_the_map(mosaic, eight):
     for words in (("--add",), ()):
         again = mosaic(photos, *words).made()
         assert "already contains this mosaic" in again.err
+    # unless files joined that cannot be used: these are named with the reason
+    (photos / "zz.jpg").write_bytes(last.read_bytes()[:3000])
+    again = mosaic(photos, "--add").made()
+    assert "already contains this mosaic" in again.err
+    assert "warning: zz.jpg is left out: " in again.err
 
 
 def test_a_first_map_is_made_where_there_is_none(mosaic, flight):

@@ -9,10 +9,11 @@ from contextlib import closing
 import numpy as np
 import pytest
 import rasterio
-from pyproj import Transformer
+from pyproj import Proj, Transformer
 from rasterio.warp import Resampling, reproject
 from typer.testing import CliRunner
 
+from skyquilt.alignment.priors import distortion
 from skyquilt.cli import app as commands
 from skyquilt.errors import OutputError, SideFileError, UsageError
 from skyquilt.raster import RasterSpec, write_array
@@ -56,6 +57,35 @@ def test_the_picture_is_the_map_pixel_for_pixel_and_lies_at_its_place(finished, 
     shown = rgba[3] > 0
     assert np.array_equal(shown, mask > 0)
     assert np.array_equal(rgba[:3][:, shown], rgb[:, shown])
+
+
+@pytest.mark.parametrize(
+    ("crs", "told"),
+    [
+        ("EPSG:32634", ()),  # the next zone
+        ("EPSG:3035", ()),
+        ("EPSG:4326", ()),
+        ("EPSG:32636", ("metre", "north")),  # three zones to the east
+        ("EPSG:32601", ("metre", "north")),  # beyond the pole
+        ("EPSG:3857", ("metre",)),
+        ("EPSG:2264", ("metre", "north")),  # feet
+    ],
+)
+def test_what_a_system_far_from_the_map_does_to_it_is_told(crs, told):
+    place = {"longitude": 14.3, "latitude": 46.6}
+    said = distortion(crs, **place)
+    assert [w in said for w in ("metre", "north")] == [w in told for w in ("metre", "north")]
+    if told:
+        factors = Proj(crs).get_factors(**place)
+        assert f"is {max(factors.meridional_scale, factors.parallel_scale):.3f} m" in said
+        turned = f"north is {abs(factors.meridian_convergence):.0f} degrees"
+        assert (turned in said) == ("north" in told)
+
+
+def test_a_distorted_export_says_so(finished, tmp_path):
+    wanted = Wanted(what=("tif", "kmz"), crs="EPSG:3857", gsd_m=0.5)
+    tif, kmz = export(finished.output, wanted, tmp_path)
+    assert "a metre on the ground" in tif.note and not kmz.note  # which has a system of its own
 
 
 def test_a_part_in_another_system_agrees_with_gdal(finished, tmp_path):

@@ -24,6 +24,8 @@ across it that is refused: a map cannot hold what photos show then.
 """
 STRETCH_MOST = 4.0
 """Scale that is refused, too, as its inverse is: that of Web Mercator at 75 degrees."""
+TURNED_TOLD_DEG = 10.0
+"""Angle between north and up that is told of an export."""
 NORTH_OFF_DEG = 3.0
 """Departure of north from where a coordinate system should have it that is refused: systems with
 axes west and south are 180 degrees off.
@@ -166,6 +168,25 @@ def stretch_warnings(frame: MapFrame) -> list[str]:
         " and heights of the map are off by as much; a map in the local UTM zone (without --crs)"
         " has true ones, and can be exported (skyquilt export --crs)."
     ]
+
+
+def distortion(crs: str, latitude: float, longitude: float) -> str:
+    """What a projection does to a place (degrees, WGS 84) that lies far from where it is meant for:
+    lengths that are not those on the ground, north that is not up. Empty where neither is so, and
+    for geographic systems.
+    """
+    if not CRS(crs).is_projected:
+        return ""
+    jacobian, name = stretch(crs, latitude, longitude), plain(crs, 80)
+    metres = CRS(crs).axis_info[0].unit_conversion_factor
+    most = _farthest_from_one(jacobian) * metres
+    turned = np.degrees(np.arctan2(*jacobian[:, 1]))
+    told = []
+    if abs(most - 1) > STRETCH_TOLD:
+        told.append(f"a metre on the ground is {most:.3f} m")
+    if abs(turned) > TURNED_TOLD_DEG:
+        told.append(f"north is {abs(turned):.0f} degrees from up")
+    return f"in {name}, {' and '.join(told)} here" if told else ""
 
 
 def _farthest_from_one(jacobian: NDArray[np.float64]) -> float:

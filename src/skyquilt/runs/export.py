@@ -106,13 +106,27 @@ def export(folder: Path, wanted: Wanted, output: Path | None = None) -> Iterator
         )
     target = output or folder / EXPORTS
     make_folder(target)
-    other = changed(folder)
+    other, bent = changed(folder), _distortion(folder, wanted)
     for what in wanted.what:
         layer = layers["heights" if what == "heights" else wanted.layer]
         done = _one(what, folder, layer, wanted, target)
         source = "footprints.geojson" if what == "footprints" else layer.file
         doubt = f"{source} is not as the run wrote it" if source in other else ""
-        yield replace(done, note="; ".join(n for n in (done.note, doubt) if n))
+        told = (done.note, "" if what in PLACED else bent, doubt)
+        yield replace(done, note="; ".join(n for n in told if n))
+
+
+def _distortion(folder: Path, wanted: Wanted) -> str:
+    """What the coordinate system asked for does to the map, see `priors.distortion`."""
+    source = FileSource(path=folder / "mosaic.tif")
+    about = source.about()
+    if wanted.crs is None or not source.crs or about is None:
+        return ""
+    from skyquilt.alignment.priors import distortion  # PROJ, only where it is needed
+
+    west, south, east, north = about.bounds
+    middle = between(source.crs, "EPSG:4326").transform((west + east) / 2, (south + north) / 2)
+    return distortion(wanted.crs, latitude=middle[1], longitude=middle[0])
 
 
 def _one(what: str, folder: Path, layer: RunLayer, wanted: Wanted, target: Path) -> Export:

@@ -46,6 +46,7 @@ from skyquilt.thermal.page import write_overlays, write_section
 from skyquilt.thermal.routes import ROUTES, Joined, as_registration, join, opened, refuse_apart
 from skyquilt.typed import as_path, instance
 from skyquilt.version import __version__
+from skyquilt.workflows.finishing import nothing_to_do
 from skyquilt.workflows.flow import Scene
 from skyquilt.workflows.methods import methods_for
 from skyquilt.workflows.mosaic import FinishedMap, make_map, run_key
@@ -120,7 +121,7 @@ def iter_thermal(
     )
     former = visual.result.metrics.get("thermal") or {}
     if former.get("key") == key and as_written(output, former.get("files")):
-        yield Note(text=f"{output} already contains this thermal map; nothing to do")
+        yield from nothing_to_do(output, "this thermal map", heats.survey.rejected, former)
         yield visual.result
         return
     refused: tuple[tuple[str, str], ...] = ()

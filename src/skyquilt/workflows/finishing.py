@@ -1,13 +1,15 @@
 """What a run tells about photos that were added, and what it leaves for more of them."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from skyquilt.model.event import Note
+from skyquilt.model.photo import RejectedPhoto
 from skyquilt.ortho.earlier import same_pose
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.orthomosaic import used_photos
+from skyquilt.photos.left_out import told_left_out
 from skyquilt.report.tables import added_sentence
 from skyquilt.workflows.finished import Finished, control_key, stamps_of
 from skyquilt.workflows.flow import AlignedPhotos, DrawnMap
@@ -57,3 +59,15 @@ def added_note(figures: Mapping[str, Any]) -> Note:
     if not figures:
         return Note(text="The map could not be continued, so all of it is made anew.")
     return Note(text=added_sentence(figures["added"]))
+
+
+def nothing_to_do(
+    output: Path, what: str, rejected: Sequence[RejectedPhoto], former: Mapping[str, Any]
+) -> Iterator[Note]:
+    """What a run tells that finds `what` it would make in `output`: files that joined since, but
+    cannot be used, by their reasons. `rejected`: those of now; `former`: the metrics of the map.
+    """
+    known = former.get("photos_rejected")
+    lost = [r for r in rejected if not isinstance(known, Mapping) or r.name not in known]
+    yield from (Note(text=text, warning=True) for text in told_left_out(lost))
+    yield Note(text=f"{output} already contains {what}; nothing to do")

@@ -44,7 +44,7 @@ from skyquilt.version import __version__
 from skyquilt.workflows.artefacts import ARTEFACTS, REGISTRY
 from skyquilt.workflows.clip_frames import frame_methods, write_frames
 from skyquilt.workflows.finished import NAME, STAGE, Earlier, earlier_map
-from skyquilt.workflows.finishing import added_figures, added_note, finished
+from skyquilt.workflows.finishing import added_figures, added_note, finished, nothing_to_do
 from skyquilt.workflows.flow import (
     ADJUSTING,
     AlignedPhotos,
@@ -188,7 +188,7 @@ def make_map(
     store.tidy()
     _forget(run, store, rerun_from)
     if run.done and (former := _figures(run.path / "metrics.json")):
-        yield Note(text=f"{run.path} already contains this mosaic; nothing to do")
+        yield from nothing_to_do(run.path, "this mosaic", given.survey.rejected, former)
         result = Result(output=run.path, metrics=former)
         return FinishedMap(result=result, given=given, methods=methods, settings=settings)
     if changed := run.changed:
