@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -10,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from skyquilt.errors import OutputError
+from skyquilt.errors import OutputError, UsageError
 from skyquilt.model.event import Result, StageFinished, StageStarted
 from skyquilt.papers.compare import CompareSettings, iter_compare
 from skyquilt.papers.compare_state import taken_up
@@ -149,3 +150,14 @@ def test_a_folder_that_cannot_be_made_is_refused_in_plain_words(tmp_path, name):
     (tmp_path / "a link").symlink_to(tmp_path / "nowhere")
     with pytest.raises(OutputError, match="a (file is a file|link is a link that leads nowhere);"):
         taken_up(tmp_path / name, "key", overwrite=False)
+
+
+def test_one_photo_compares_nothing(flight, tmp_path):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    first, second, *_ = sorted((flight / "photos").glob("*.jpg"))
+    shutil.copy(first, photos)
+    (photos / "cut.jpg").write_bytes(second.read_bytes()[:3000])
+    with pytest.raises(UsageError, match="two photos or more.*cut.jpg"):
+        compared(photos, tmp_path / "out")
+    assert not (tmp_path / "out").exists()

@@ -118,7 +118,7 @@ def iter_compare(
             photos is not an error; it gets a row with the reason.
     """
     given = read_input(folder, settings.mosaic.input)
-    given = given if given.survey.clips else _first(given, settings.first)
+    given = given if given.survey.clips else _compared(given, settings.first)
     key = digest(
         run_key(given, settings.mosaic, methods_for(settings.mosaic)),
         _content(settings.known),
@@ -130,7 +130,7 @@ def iter_compare(
             store=Store(folder=output / STATE / "store", registry=REGISTRY), began=Clock.now()
         )
         given = yield from frames_added(given, settings.mosaic, clock)
-        given = _first(given, settings.first)
+        given = _compared(given, settings.first)
     rows = _Rows(given, output, overwrite=overwrite or goes_on)  # the runs below belong to it
     base, says = _judged_by(given, output, settings)
     state.write(output)
@@ -197,8 +197,18 @@ class _Rows:
         return bool(self.by_name[name].get("metrics", {}).get("metadata_conflicts"))
 
 
-def _first(given: SurveyInput, count: int | None) -> SurveyInput:
-    """The survey with only the first `count` photos in order of capture."""
+def _compared(given: SurveyInput, count: int | None) -> SurveyInput:
+    """The survey with only the first `count` photos in order of capture.
+
+    Raises:
+        UsageError: there is one photo, by which no two methods differ.
+    """
+    if len(given.survey.photos) < 2:
+        lost = "; ".join(f"{r.name}: {r.reason}" for r in given.survey.rejected[:3])
+        raise UsageError(
+            "a comparison needs two photos or more, and one can be read here"
+            + (f" (left out: {lost})" if lost else "")
+        )
     if count is None:
         return given
     photos = given.survey.photos[:count]
@@ -218,11 +228,11 @@ def _judged_by(
     if base.input.distances is not None:
         return base, f"known distances of {base.input.distances.name}"
     if settings.known is None:
-        return base, "no distances are known"
+        return base, "nothing: no distances are known, and fewer than two photos tell their place"
     control, _ = read_gcp_list(settings.known, [p.name for p in given.survey.photos])
     seen = [c for c in control if c.observations][:MOST_POINTS]
     if len(seen) < 2:
-        return base, f"fewer than two points of {settings.known.name} are visible"
+        return base, f"nothing: fewer than two points of {settings.known.name} are visible"
     path = _write_distances(output / "distances.csv", _between(seen))
     says = f"distances between {len(seen)} points of {settings.known.name}"
     return base.changed(distances=path), says
