@@ -13,7 +13,7 @@ from skyquilt.geometry.frames import cam_R_map_from_angles
 from skyquilt.imaging.blank import around, joined
 from skyquilt.imaging.views import make_views, native_gsd
 from skyquilt.ortho.lasting_marks import _hardly_varying, _is_mark
-from skyquilt.ortho.spoilt import coarser_parts, spoilt_parts
+from skyquilt.ortho.spoilt import _spots, coarser_parts, spoilt_parts
 from skyquilt.ortho.tie_surface import level
 from skyquilt.settings import MosaicSettings
 from skyquilt.simulate import preset, simulate
@@ -269,6 +269,18 @@ def test_what_photos_circle_around_is_no_dust():
     for picture in taken.values():
         picture[95:135, 180:220] //= 2
     assert shown(alignment, taken) == ({}, ())
+
+
+def test_chance_is_no_dust_where_few_values_tell_of_each_cell():
+    """Nine values in a cell, of ground that looks different from two directions patch by patch, as
+    trees do: where all nine of two neighbours agree by chance, their scatter tells nothing.
+    """
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        place = rng.uniform(-0.5, 0.5, (11_000, 2)) * [1.7, 1.0]
+        row, column = ((place + [0.85, 0.5]) * [100 / 1.7, 60]).astype(int).T
+        off = rng.normal(0, 0.25, (100, 60))[row, column] + rng.laplace(0, 0.1, len(place))
+        assert not _spots(place, off, (2000, 1176)).any()
 
 
 @pytest.mark.parametrize("apart", [30.0, 70.0])

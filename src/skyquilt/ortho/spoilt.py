@@ -37,9 +37,9 @@ SPOT_POINTS, SPOT_CELLS = 12_000, 48
 """Ground points that are compared, and cells of a picture along its longer side: so many points
 give each cell some 20 values, whatever the number of photos.
 """
-DARKER, SURELY = 0.06, 6.0
+DARKER, SURELY = 0.06, 5.0
 """A cell is darkened by a spot where its median lies so far, in log odds, and by so many of its
-standard deviations below those around: dust takes 0.2 to 0.5.
+standard deviations below those around: dust takes 0.2 to 0.5. Chance makes 3 of them.
 """
 APART = 0.03
 """Two photos of a camera are compared whose places differ by more than this share of their height,
@@ -341,19 +341,25 @@ def _spots(
     at = row * shape[1] + column
     count = np.bincount(at, minlength=shape[0] * shape[1]).reshape(shape)
     low, middle, high = _quartiles(at, off, count.size).reshape(3, *shape)
-    sigma = SIGMA_OF_QUARTILES * (high - low) / np.sqrt(np.maximum(count, 1))
-    pad = np.pad(middle, WITHIN // 2, mode="reflect")
-    near = np.lib.stride_tricks.sliding_window_view(pad, (WITHIN, WITHIN))
-    near = near.reshape(*shape, -1)
-    known = np.isfinite(near).any(2, keepdims=True)
-    beside = np.where(known[..., 0], np.nanmedian(np.where(known, near, 0.0), 2), np.nan)
+    # of eight values the quartiles alone may lie close together by chance
+    spread = np.fmax(high - low, _median_around(high - low))
+    sigma = SIGMA_OF_QUARTILES * spread / np.sqrt(np.maximum(count, 1))
     with np.errstate(invalid="ignore"):
-        dark = middle - beside < -np.maximum(DARKER, SURELY * sigma)
+        dark = middle - _median_around(middle) < -np.maximum(DARKER, SURELY * sigma)
     dark &= count >= FEWEST_VALUES
     square = np.ones((3, 3), np.uint8)  # one cell alone may be chance
     together = cv2.filter2D(dark.view(np.uint8), -1, square, borderType=cv2.BORDER_CONSTANT)
     spot = cv2.dilate((dark & (together > 1)).view(np.uint8), square) > 0
     return spot if spot.mean() <= LARGEST_SPOT else np.zeros_like(spot)
+
+
+def _median_around(cells: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The median of the cells (rows, columns) around each; NaN where all of them are."""
+    pad = np.pad(cells, WITHIN // 2, mode="reflect")
+    near = np.lib.stride_tricks.sliding_window_view(pad, (WITHIN, WITHIN))
+    near = near.reshape(*cells.shape, -1)
+    known = np.isfinite(near).any(2, keepdims=True)
+    return np.where(known[..., 0], np.nanmedian(np.where(known, near, 0.0), 2), np.nan)
 
 
 def _shares(place: NDArray[Any], size: tuple[int, int]) -> NDArray[np.float64]:

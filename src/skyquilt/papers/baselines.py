@@ -115,8 +115,8 @@ def told(known: Sequence[Baseline]) -> str:
     sigma = float(np.median([n.sigma_m for n in known]))
     return (
         f"{len(known)} baseline{'s' if len(known) > 1 else ''} between cameras by their reported"
-        f" positions (standard deviation of each {sigma:.1f} m), which position and pose repeat and the other methods use in part;"
-        " no distance on the ground is known"
+        f" positions (standard deviation of each {sigma:.1f} m), which position and pose repeat and the"
+        " other methods use in part; no distance on the ground is known"
     )
 
 
