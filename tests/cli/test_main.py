@@ -392,6 +392,18 @@ def test_too_few_addresses_get_a_sentence(tmp_path):
     assert in_shell('ulimit -v 1000000; "$@"', "mosaic", tmp_path, "-o", tmp_path / "out")[0] == 3
 
 
+@pytest.mark.slow
+def test_too_few_open_files_get_a_sentence(tmp_path):
+    """With these, the live map's server ended in a traceback, and its tiles could not be opened."""
+    words = ("live", tmp_path, "-o", tmp_path / "out", "--port", "0")
+    code, told = in_shell('ulimit -n 24; "$@"', *words)
+    assert code == 1 and told.count("\n") == 1
+    assert told.startswith("skyquilt: the system allows 24 open files")
+    assert not (tmp_path / "out").exists()
+    # a limit that the program may raise is raised
+    assert in_shell('ulimit -S -n 24; "$@"', *words, "--max-mb", "0")[0] == 2
+
+
 @pytest.mark.parametrize(
     "error",
     [

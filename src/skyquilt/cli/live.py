@@ -142,7 +142,13 @@ def command(
     """
     with ends_at_once():
         from skyquilt.cli.progress import show_live
-        from skyquilt.engine.memory_watch import MEMORY_GB, ends_run, limit_bytes
+        from skyquilt.engine.memory_watch import (
+            MEMORY_GB,
+            OPEN_FILES,
+            ends_run,
+            enough_files,
+            limit_bytes,
+        )
         from skyquilt.errors import UsageError
         from skyquilt.live.fill import known_plan
         from skyquilt.live.folder_watch import apart, create_inbox
@@ -154,6 +160,7 @@ def command(
         from skyquilt.server.server_process import ServerConfig, ServerProcess
         from skyquilt.settings import within
     mode = mode_of(quiet=quiet, json=json)
+    enough_files(OPEN_FILES)
     within("--max-mb", max_mb, 0.01, 1e5, "MB")
     within("--max-clip-mb", max_clip_mb, 0.01, 1e6, "MB")
     within("--viewer-memory", viewer_memory, *MEMORY_GB, "GB")

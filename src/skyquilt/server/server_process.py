@@ -18,7 +18,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from skyquilt.engine.error_log import log_error
-from skyquilt.engine.memory_watch import MemoryWatch
+from skyquilt.engine.memory_watch import MemoryWatch, enough_files
 from skyquilt.errors import SkyquiltError, UsageError
 from skyquilt.live.fill import known_plan
 from skyquilt.live.inbox import Inbox
@@ -168,17 +168,6 @@ def _end_with_parent(parent: int) -> None:
         os._exit(0)
 
 
-def _more_files() -> None:
-    """As many open files as the system allows, since each connection is one."""
-    if sys.platform == "win32":  # it sets no such limit
-        return
-    import resource
-
-    with suppress(ValueError, OSError):
-        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-        resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, min(hard, 8192)), hard))
-
-
 def _too_large(asked: ServerConfig, taken: int) -> None:
     """Ends the process; its parent starts another one on the same socket."""
     text = f"the viewer took {taken / 1e9:.1f} of {asked.most_memory / 1e9:.1f} GB and is restarted"
@@ -195,7 +184,7 @@ def _serve(
     other.close()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl+C
     _end_with_parent(asked.parent)
-    _more_files()
+    enough_files()  # each connection is one
     if sys.platform != "win32":
         with suppress(OSError):
             os.nice(NICE)
