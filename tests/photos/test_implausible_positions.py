@@ -193,3 +193,46 @@ def test_a_missing_reference_of_a_position_is_told(make_jpeg):
     assert not any("north and east are assumed" in n for n in told.notes)
     assert any("north and east are assumed" in n for n in read_photo(path).notes)
     assert any("1 photos do not say" in n for n in read_survey(path.parent).notes)
+
+
+def survey_with(make_jpeg, told, number=6):
+    """A line of photos whose GPS directories have further tags, by photo."""
+    for k in range(number):
+        gps = gps_exif(46.5 + 1e-4 * k, -92.0) | told.get(k, {})
+        exif = dji_exif(GPS=gps)
+        exif["Exif"][piexif.ExifIFD.DateTimeOriginal] = f"2016:06:23 16:31:{k:02d}"
+        path = make_jpeg(exif=exif, name=f"{k}.jpg", seed=k)
+    return read_survey(path.parent)
+
+
+@pytest.mark.parametrize(
+    ("told", "wider", "word"),
+    [
+        ({piexif.GPSIFD.GPSStatus: "V"}, (20, 20), "GPSStatus V"),
+        ({piexif.GPSIFD.GPSMeasureMode: "2"}, (1, 20), "GPSMeasureMode 2"),
+        ({piexif.GPSIFD.GPSDOP: (30, 1)}, (4, 4), ""),
+        ({piexif.GPSIFD.GPSDOP: (9, 4), piexif.GPSIFD.GPSStatus: "A"}, (1, 1), ""),
+    ],
+)
+def test_what_a_receiver_did_not_measure_counts_for_little(make_jpeg, told, wider, word):
+    survey = survey_with(make_jpeg, {1: told, 4: told})
+    assert not survey_notes_about(survey, "GPS") or word
+    usual, *_ = (p.position for p in survey.photos)
+    for k, photo in enumerate(survey.photos):
+        xy, z = wider if k in (1, 4) else (1, 1)
+        assert photo.position.sigma_xy_m == pytest.approx(xy * usual.sigma_xy_m)
+        assert photo.position.sigma_z_m == pytest.approx(z * usual.sigma_z_m)
+    named = survey_notes_about(survey, word) if word else []
+    assert [("1.jpg" in n, "4.jpg" in n) for n in named] == [(True, True)] * bool(word)
+
+
+@pytest.mark.parametrize("tag", [piexif.GPSIFD.GPSStatus, piexif.GPSIFD.GPSMeasureMode])
+def test_a_camera_that_always_says_so_tells_nothing(make_jpeg, tag):
+    told = {tag: "V" if tag == piexif.GPSIFD.GPSStatus else "2"}
+    survey = survey_with(make_jpeg, dict.fromkeys(range(5), told))
+    assert len({p.position.sigma_z_m for p in survey.photos}) == 1
+    assert not survey_notes_about(survey, "measured no")
+
+
+def survey_notes_about(survey, word):
+    return [n for n in survey.notes if word in n]

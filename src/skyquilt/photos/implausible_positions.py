@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from skyquilt.model.photo import Datum, Photo
 from skyquilt.photos.side_rows import sentence_of
+from skyquilt.photos.tags import NO_FIX, NO_HEIGHT
+from skyquilt.photos.unmeasured import flat, void
 
 Array = NDArray[np.float64]
 _METRES_PER_DEGREE = 111_320.0
@@ -290,13 +292,14 @@ def _unplaced(photo: Photo, distance_m: float) -> Photo:
 
 
 def with_coarse_deviations(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
-    """The photos (in order of capture) with larger deviations where their positions are rounded or
-    repeat the one before, and notes on these.
+    """The photos (in order of capture) with larger deviations where their positions are rounded,
+    repeat the one before or were not measured, and notes on these.
     """
+    unmeasured = (void, flat) if any({NO_FIX, NO_HEIGHT} & {*p.notes} for p in photos) else ()
     kept, notes = list(photos), list[str]()
     for key in dict.fromkeys(p.camera_key for p in photos if p.position):
         own = [i for i, p in enumerate(photos) if p.position and p.camera_key == key]
-        for coarse in (_rounded, _repeated):
+        for coarse in (_rounded, _repeated, *unmeasured):
             given = [kept[i] for i in own]
             found, note = coarse(given)
             for i, photo in zip(own, found, strict=True):

@@ -46,6 +46,7 @@ def read_position(exif: Exif, xmp: Xmp) -> tuple[GeoPosition | None, tuple[str, 
         found, source = _place(_exif_degrees(exif), "EXIF", notes), "exif"
         if found is not None and not _hemispheres_told(exif):
             notes.append(NO_HEMISPHERE)
+        notes += tag.unmeasured(exif) if found is not None else []
     if found is None:
         return None, tuple(notes or ["It has no GPS position."])
     takeoff, sea, ellipsoid = _heights(exif, xmp, notes)
@@ -193,7 +194,7 @@ def _sigmas(exif: Exif, xmp: Xmp, notes: list[str], *, drone: bool) -> tuple[flo
     """Horizontal and vertical standard deviation in m: RTK's own, an accuracy tag, or a typical
     value.
     """
-    xy, z = _DRONE_SIGMA if drone else _CAMERA_SIGMA
+    xy, z = (s * tag.dilution(exif) for s in (_DRONE_SIGMA if drone else _CAMERA_SIGMA))
 
     def said(value: float | None) -> float | None:
         """A stated accuracy; zero means that it is not known."""

@@ -29,6 +29,7 @@ EXPOSURE_S, F_NUMBER, ISO, ISO_SPEED = 0x829A, 0x829D, 0x8827, 0x8833
 BITS, BLACK_LEVEL = 258, 50714
 GPS_LAT_REF, GPS_LAT, GPS_LON_REF, GPS_LON, GPS_ALT_REF, GPS_ALT = 1, 2, 3, 4, 5, 6
 GPS_TIME, GPS_ERROR, GPS_DATE, GPS_DIRECTION = 7, 0x1F, 0x1D, 0x11
+GPS_STATUS, GPS_MODE, GPS_DILUTION = 9, 10, 11
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -94,7 +95,7 @@ _EXIF_TAGS = _COUNT_TAGS | frozenset(
 )
 _GPS_TAGS = frozenset(
     {GPS_LAT_REF, GPS_LAT, GPS_LON_REF, GPS_LON, GPS_ALT_REF, GPS_ALT, GPS_TIME, GPS_ERROR}
-    | {GPS_DATE, GPS_DIRECTION}
+    | {GPS_DATE, GPS_DIRECTION, GPS_STATUS, GPS_MODE, GPS_DILUTION}
 )
 _FORMS = {1: "B", 2: "s", 3: "H", 4: "I", 5: "II", 6: "b", 7: "s", 8: "h", 9: "i", 10: "ii"} | {
     11: "f",
@@ -192,6 +193,26 @@ def _below(
         return directories.read(at, wanted) if isinstance(at, int) else {}
     except (ValueError, OSError, struct.error, OverflowError):
         return {}
+
+
+NO_FIX = "Its receiver measured no position then, and wrote an earlier one (GPSStatus V)."
+NO_HEIGHT = "Its receiver measured no height then (GPSMeasureMode 2)."
+"""Notes of photos whose GPS directory says so."""
+DILUTIONS = 5.0, 20.0
+"""Dilution of precision up to which positions err as usual, and from which they err no more."""
+
+
+def unmeasured(exif: Exif) -> list[str]:
+    """Those of the notes above that apply."""
+    void = as_text(exif.gps.get(GPS_STATUS)).upper() == "V"
+    flat = as_text(exif.gps.get(GPS_MODE)) == "2"
+    return [NO_FIX] * void + [NO_HEIGHT] * flat
+
+
+def dilution(exif: Exif) -> float:
+    """Factor by which few satellites widen the deviations of the position."""
+    usual, most = DILUTIONS
+    return min(max(as_number(exif.gps.get(GPS_DILUTION)) or 0.0, usual), most) / usual
 
 
 _KNOWN = {
