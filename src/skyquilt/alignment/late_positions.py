@@ -7,6 +7,7 @@ Along a line such positions look right, and where a drone turns they do not; so 
 a map that they hold in place. From a missing line on, all that follow are shifted.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 
 from skyquilt.alignment.motion import Speeds
+from skyquilt.alignment.same_place import NEAR
 from skyquilt.alignment.similarity_graph import fit_similarity
 from skyquilt.geometry.frames import angle_difference_deg, angles_from_cam_R_map
 from skyquilt.model.poses import Alignment, MapFrame, Prior
@@ -80,12 +82,26 @@ def unshifted(found: Alignment, priors: Sequence[Prior], cameras: Sequence[str])
     """
     out = list(priors)
     for camera in dict.fromkeys(cameras):
-        own = [i for i, c in enumerate(cameras) if c == camera]
+        own = _spread(found, [i for i, c in enumerate(cameras) if c == camera])
         for k, late in enumerate(_shifts(found, priors, own).tolist()):
             if late:
                 source = priors[own[k + late]] if 0 <= k + late < len(own) else None
                 out[own[k]] = _at(priors[own[k]], source)
     return out if any(a is not b for a, b in zip(out, priors, strict=True)) else priors
+
+
+def _spread(found: Alignment, photos: Sequence[int]) -> list[int]:
+    """The photos without most of those of a hover: a map shrunk to nothing would explain theirs."""
+    placed = {i: found.poses[i].map_C for i in photos if i in found.poses}
+    high = float(np.median([C[2] for C in placed.values()] or [0.0])) - found.ground_m
+    if not high > 0:
+        return list(photos)
+    there, kept = Counter[tuple[float, ...]](), list[int]()
+    for i in photos:
+        cell = (*np.round(placed[i][:2] / (NEAR * high)),) if i in placed else (i,)
+        there[cell] += 1
+        kept += [i] if there[cell] <= MOST else []
+    return kept
 
 
 def as_moved(
