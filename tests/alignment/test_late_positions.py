@@ -103,6 +103,21 @@ def test_positions_that_are_right_stay(sigma, seed):
     assert unshifted(block(LINES), far, ["A"] * len(LINES)) is far
 
 
+@pytest.mark.parametrize("after", [True, False])
+@pytest.mark.parametrize("sigma", [0.0, 0.3])
+@pytest.mark.parametrize("seed", range(2))
+def test_a_hover_beside_a_flight_moves_nothing(after, sigma, seed):
+    """Of twelve and thirty photos a map shrunk to nothing explains seven tenths, however moved."""
+    flight, rng = LINES[:12], np.random.default_rng(seed)
+    hover = flight[6] + rng.normal(0, 0.01, (30, 3))
+    placed = np.concatenate([flight, hover] if after else [hover, flight])
+    told = flight + rng.normal(0, 1.5, flight.shape)
+    still = flight[6] + rng.normal(0, 1.5, 3) + rng.normal(0, sigma, (30, 3))
+    told = np.concatenate([told, still] if after else [still, told])
+    priors = [prior(C, sigma=1.5) for C in told]
+    assert unshifted(block(placed), priors, ["A"] * len(placed)) is priors
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(40))
 def test_noise_that_is_not_told_and_positions_in_any_order_move_nothing(seed):
