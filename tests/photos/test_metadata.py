@@ -235,3 +235,25 @@ def test_panoramas_are_left_out(tmp_path):
     found = read_photo(tmp_path / "around.jpg")
     assert isinstance(found, RejectedPhoto)
     assert "panorama (equirectangular)" in found.reason
+
+
+@pytest.mark.parametrize(
+    ("parts", "degrees"),
+    [
+        (((46, 1), (35, 1), (59128, 1000)), 46 + 35 / 60 + 59.128 / 3600),
+        (((46, 1), (35985467, 10**6), (0, 1)), 46 + 35.985467 / 60),
+        (((46599758, 10**6), (0, 1), (0, 1)), 46.599758),
+        (((46, 1), (35985467, 10**6), (59128, 1000)), 46 + 35 / 60 + 59.128 / 3600),
+        (((46599758, 10**6), (35985467, 10**6), (59128, 1000)), 46 + 35 / 60 + 59.128 / 3600),
+        (((46, 1), (59, 1), (60, 1)), 47.0),  # rounded
+        (((46, 1), (35, 1), (5913, 1)), None),  # a denominator lost
+        (((46, 1), (3598, 1), (0, 1)), None),
+    ],
+)
+def test_parts_of_degrees(make_jpeg, parts, degrees):
+    gps = gps_exif(46.5, -92.0) | {piexif.GPSIFD.GPSLatitude: parts}
+    photo = read_photo(make_jpeg(exif=dji_exif(GPS=gps)))
+    if degrees is None:
+        assert photo.position is None and any("beyond 60" in n for n in photo.notes)
+    else:
+        assert photo.position.latitude_deg == pytest.approx(degrees, abs=1e-6)

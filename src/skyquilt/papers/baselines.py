@@ -113,10 +113,11 @@ def unjudged(column: Mapping[str, Any], known: Sequence[Baseline]) -> dict[str, 
 def told(known: Sequence[Baseline]) -> str:
     """What the methods are judged by, as the end of a sentence."""
     sigma = float(np.median([n.sigma_m for n in known]))
+    several = "baselines" if len(known) > 1 else "baseline"
     return (
-        f"{len(known)} baseline{'s' if len(known) > 1 else ''} between cameras by their reported"
-        f" positions (standard deviation of each {sigma:.1f} m), which position and pose repeat and the"
-        " other methods use in part; no distance on the ground is known"
+        f"{len(known)} {several} between cameras by their reported positions (standard deviation of"
+        f" each {sigma:.1f} m), which position and pose repeat and the other methods use in part;"
+        " no distance on the ground is known"
     )
 
 

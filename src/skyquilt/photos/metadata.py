@@ -75,7 +75,7 @@ def read_height(exif: Exif, xmp: Xmp) -> float | None:
 def why_void(latitude: float | None, longitude: float | None) -> str:
     """Why a pair of degrees is not a position; empty when it is one."""
     if latitude is None or longitude is None:
-        return "one of latitude and longitude is missing or not a number"
+        return "one of latitude and longitude is missing, not a number, or has parts beyond 60"
     if latitude == 0 and longitude == 0:
         return "it is (0, 0), which receivers write without a satellite fix"
     if not (abs(latitude) <= 90 and abs(longitude) <= 180):
@@ -131,15 +131,16 @@ def _hemispheres_told(exif: Exif) -> bool:
 
 def _sexagesimal(value: object, reference: str) -> float | None:
     parts = list(value) if isinstance(value, (tuple, list)) else [value]
-    numbers = [as_number(part) for part in parts[:3]]
-    if not numbers or numbers[0] is None:
+    numbers = [n for part in parts[:3] if (n := as_number(part)) is not None]
+    if not numbers or len(numbers) < len(parts[:3]) or any(abs(n) > 60 for n in numbers[1:]):
         return None
-    degrees = sum(abs(n or 0.0) / 60**i for i, n in enumerate(numbers))
-    if any(n is None for n in numbers) or not math.isfinite(degrees):
-        return None
+    size = [abs(n) for n in numbers]
+    # some programs write decimals in each part, which tell the smaller parts again
+    whole = [math.floor(n + 1e-6) if any(size[k + 1 :]) else n for k, n in enumerate(size)]
+    degrees = sum(n / 60**i for i, n in enumerate(whole))
     # some programs write both a sign and a reference
-    negative = any(n is not None and n < 0 for n in numbers)
-    return float(-degrees if negative or reference.upper()[:1] in ("S", "W") else degrees)
+    negative = any(n < 0 for n in numbers) or reference.upper()[:1] in ("S", "W")
+    return float(-degrees if negative else degrees)
 
 
 def _heights(
