@@ -358,7 +358,7 @@ def _median_around(cells: NDArray[np.float64]) -> NDArray[np.float64]:
     pad = np.pad(cells, WITHIN // 2, mode="reflect")
     near = np.lib.stride_tricks.sliding_window_view(pad, (WITHIN, WITHIN))
     near = near.reshape(*cells.shape, -1)
-    known = np.isfinite(near).any(2)
+    known = np.asarray(np.isfinite(near).any(2))
     found = np.nanmedian(np.where(known[..., None], near, 0.0), 2)
     return np.asarray(np.where(known, found, np.nan))
 
