@@ -415,6 +415,9 @@ def test_photos_that_an_adjustment_turned_are_taken_to_report_that(round_about):
     assert turned_priors(found, nowhere) is None
     (says,) = tilt_warnings(nowhere, found)
     assert "was taken to be level" in says and "rest on positions" not in says
+    across = [replace(p, map_C=np.r_[p.map_C[:2], np.nan]) for p in level]  # as in clips of Mavic 2
+    (says,) = tilt_warnings(across, found)
+    assert "none reports a height or camera angles: that plane was taken to be level" in says
 
 
 def test_walls_around_what_photos_show_from_above_are_told():

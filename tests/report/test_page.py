@@ -335,6 +335,19 @@ def test_worth_a_look_names_what_is_worst_and_nothing_where_all_is_well():
     assert "the compass is off" in page.text  # the cause as metrics.json gives it
 
 
+def test_a_guessed_readout_is_told_beside_what_was_found_and_not_where_it_moves_nothing():
+    guess = {"source": "guess", "prior_ms": 20.0}
+    shutter = {
+        "a": {**guess, "readout_ms": 18.42, "sigma_ms": 17.33, "largest_displacement_px": 1.14},
+        "b": {**guess, "readout_ms": 0.02, "sigma_ms": 0.4, "largest_displacement_px": 0.01},
+        "c": {**guess, "readout_ms": 0.02, "sigma_ms": 0.4, "largest_displacement_px": 0.0},
+    }
+    metrics = {"photos_used": 9, "photos_total": 9, "blocks": [9], "shutter": shutter}
+    (told,) = attended(metrics=metrics, views=np.full((20, 20), 7), crs="EPSG:32633")
+    assert "a guess of 20 ms was adjusted to 18.4 \u00b1 17.3 ms" in told
+    assert "of a, whose shutter" in told
+
+
 def test_measured_values_have_a_legend_with_their_unit():
     page = Page(build_report(run(values=(12.3, 35.1, "\u00b0C"))))
     assert "12.3 \u00b0C" in page.text and "35.1 \u00b0C" in page.text

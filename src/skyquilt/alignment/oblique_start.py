@@ -138,10 +138,12 @@ def tilt_warnings(
     if not turned_far(found, priors):
         return _walls(priors, found, most_view_deg)
     if np.isnan(off_positions(found, priors)):
+        across = any(np.isfinite(priors[i].map_C[:2]).all() for i in found.held)
+        lacking, wanted = ("height", "heights") if across else ("position", "positions")
         return [
             "Most photos look far from straight down at the plane that most of the ground lies"
-            " in, and none reports a position or camera angles: that plane was taken to be level."
-            " Give positions, camera angles or control points if the ground slopes."
+            f" in, and none reports a {lacking} or camera angles: that plane was taken to be level."
+            f" Give {wanted}, camera angles or control points if the ground slopes."
         ]
     return [
         "Most photos look far from straight down, and none reports its camera angles: heights,"

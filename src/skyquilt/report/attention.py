@@ -14,6 +14,8 @@ FEW_VIEWS, FEW_SHARE = 3, 0.1
 """Number of photos that show a place well, and the share of the map with fewer from which this is
 told.
 """
+LEAST_MS, LEAST_PX = 0.5, 0.05
+"""Readout of a rolling shutter, and shift by it, below which it is none."""
 Sentence = tuple[str, str]
 """A sentence, and the section that shows more."""
 
@@ -91,17 +93,18 @@ def _shutter(m: Mapping[str, Any]) -> Iterator[Sentence]:
                 " is rolling, give --shutter rolling and --shutter-readout.",
                 "cameras",
             )
-        elif readout > 0 and moved == 0:
+        elif readout >= LEAST_MS and moved == 0:
             yield (
                 f"Shutter not modelled: that of {plain(camera)} is rolling"
                 f" ({fixed(readout, 0)} ms), and nothing tells how fast it moved.",
                 "cameras",
             )
-        elif source == "guess":
+        elif source == "guess" and moved >= LEAST_PX:
             yield (
-                f"The rolling shutter of {plain(camera)} is modelled with a guessed readout of"
-                f" {fixed(readout, 0)} ms, which moves places by up to {fixed(moved, 1)} px;"
-                " --shutter-readout if you know better.",
+                f"Nothing tells the readout of {plain(camera)}, whose shutter is rolling: a guess of"
+                f" {fixed(told.get('prior_ms'), 0)} ms was adjusted to {fixed(readout, 1)} \u00b1"
+                f" {fixed(told.get('sigma_ms'), 1)} ms, which moves places by up to"
+                f" {fixed(moved, 1)} px; --shutter-readout if you know better.",
                 "cameras",
             )
 
