@@ -32,7 +32,7 @@ from skyquilt.alignment.outcome import (
 from skyquilt.alignment.problem import Problem, State
 from skyquilt.alignment.repairs import begun_with, repaired
 from skyquilt.alignment.setup import Setup, camera_records, pose_records, priors_by_camera, set_up
-from skyquilt.alignment.stages import fine_steps, plain, rough_steps, settled, weighed
+from skyquilt.alignment.stages import fine_steps, plain, rough_steps, settled, spinning, weighed
 from skyquilt.alignment.start import Start, find_start, focals_by_heights, ground_of, with_focals
 from skyquilt.alignment.told_poses import believe_told
 from skyquilt.alignment.tracks import Thinning, Tracks, blocks_of, build_tracks, thin
@@ -245,8 +245,9 @@ class Bundle:
         for step in rough_steps(keep.within("rough")):
             problem, state = step(problem, state)
         del step  # some hold a factor
-        setup = setup.moving_as(photos, state.C)
+        setup = setup.moving_as(photos, state)
         problem = replace(problem, velocity=setup.base.velocity)
+        state = spinning(problem, state, setup)
         method = self.match_observations
         make_room()
         if sharp := grey is not None and method is not None:
@@ -270,7 +271,7 @@ class Bundle:
                 said += (turned_note([photos[i].name for i in setup.members[found.rows]]),)
                 problem, state, setup = found.problem, found.state, found.setup
                 aside = SetAside(found.turned_tracks(aside.get()), large=large)
-        setup = setup.moving_as(photos, state.C)
+        setup = setup.moving_as(photos, state)
         problem = replace(problem, velocity=setup.base.velocity)
         if self.thorough:
             problem, state = weighed(problem, state, setup, keep.within("weighed"), near)

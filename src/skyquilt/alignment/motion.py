@@ -3,10 +3,11 @@
 A rolling shutter exposes the rows of a photo one after the other while the camera flies on.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from skyquilt.geometry.frames import angle_difference_deg, commonest_deg
 from skyquilt.model.photo import Photo
@@ -21,6 +22,10 @@ STRAIGHT_DEG = 30.0
 """A flight that turns by more than this in degrees from one leg to the next is on another line."""
 LONGEST_GAP_S = 60.0
 """Photos further apart than this in s do not tell the speed in between."""
+LEAST_GAP_S, SPUN_APART_S = 0.05, 2.0
+"""Photos nearer to one another than this in s have no rate; those further apart than the second do
+not tell how fast the camera turned at each.
+"""
 HOVERS = 0.3
 """A drone that reports less than this share of its mean speed slows down for its photos."""
 FEWEST_HEADED, MOST_ALIKE, AMBIGUOUS_DEG = 4, 0.8, 20.0
@@ -51,12 +56,7 @@ def velocities(photos: Sequence[Photo], C: Array) -> Array:
     """
     out = np.zeros((len(photos), 3))
     time = seconds(photos)
-    keys: dict[str, list[int]] = {}
-    for i, photo in enumerate(photos):
-        if np.isfinite(time[i]):
-            keys.setdefault(photo.camera_key, []).append(i)
-    for group in keys.values():
-        order = np.array(sorted(group, key=lambda i: (time[i], photos[i].name)))
+    for order in _in_order(photos, time):
         out[order] = _along(time[order], C[order])
     for i, photo in enumerate(photos):
         said = photo.velocity_ned
@@ -67,6 +67,36 @@ def velocities(photos: Sequence[Photo], C: Array) -> Array:
         if speed == 0 or np.linalg.norm(reported) < HOVERS * speed:
             out[i] = reported
     return out
+
+
+def spins(photos: Sequence[Photo], R: Array) -> tuple[Array, Array]:
+    """Rates (n, 3) in rad/s at which cameras with rotations R (n, 3, 3) from map to camera turn
+    about their axes while photos are taken, as frames of a clip do where the drone turns, and by
+    how much each may be off (n,): by the turns from the photo before and to the one after. Zero
+    where no photo was taken so near in time.
+    """
+    rate, off, time = np.zeros((len(photos), 3)), np.zeros(len(photos)), seconds(photos)
+    for order in _in_order(photos, time):
+        gap = np.diff(time[order])
+        leg = Rotation.from_matrix(R[order[1:]] @ np.swapaxes(R[order[:-1]], 1, 2)).as_rotvec()
+        near = (gap > LEAST_GAP_S) & (gap < SPUN_APART_S)
+        leg[near] /= gap[near, None]
+        for k, i in enumerate(order):
+            known = [leg[n] for n in (k - 1, k) if 0 <= n < len(leg) and near[n]]
+            if known:
+                rate[i] = np.mean(known, axis=0)
+                off[i] = np.linalg.norm(known[0] - (known[1] if known[1:] else 0.0)) / 2
+    return rate, off
+
+
+def _in_order(photos: Sequence[Photo], time: Array) -> Iterator[NDArray[np.int64]]:
+    """The photos of each camera that have a time (n,) in s, in order of it."""
+    keys: dict[str, list[int]] = {}
+    for i, photo in enumerate(photos):
+        if np.isfinite(time[i]):
+            keys.setdefault(photo.camera_key, []).append(i)
+    for group in keys.values():
+        yield np.array(sorted(group, key=lambda i: (time[i], photos[i].name)))
 
 
 def velocities_of(photos: Sequence[Photo], alignment: Alignment) -> dict[int, Array]:
@@ -126,7 +156,7 @@ def _along(time: Array, C: Array) -> Array:
         return out
     gap, step = np.diff(time), np.diff(C, axis=0)
     leg = np.full((n - 1, 3), np.nan)
-    timed = (gap > 0.05) & (gap < LONGEST_GAP_S)
+    timed = (gap > LEAST_GAP_S) & (gap < LONGEST_GAP_S)
     leg[timed] = step[timed] / gap[timed, None]
     leg[np.linalg.norm(np.nan_to_num(leg), axis=1) > FASTEST_MS] = np.nan
     whole = bool((np.abs(time - np.round(time)) < 1e-6).all())

@@ -149,7 +149,9 @@ class Problem:
     velocity: Array
     """(n, 3) velocity of each camera in m/s in the map frame; zero where unknown."""
     sigma_turn: Array | None = None
-    """(n,) deviations of `State.turn` from zero in rad; None = turns are not estimated."""
+    """(n,) deviations of `State.turn` from `turn0` in rad; None = turns are not estimated."""
+    turn0: Array | None = None
+    """(n, 3) what `State.turn` is expected to be in rad; None = zero."""
 
     @property
     def share(self) -> Array:
@@ -204,7 +206,6 @@ class Problem:
         inside = number[self.photo] >= 0
         seen = np.bincount(self.point[inside], minlength=len(self.X0))
         part, points = self.only(inside & (seen >= 2)[self.point])
-        turns = self.sigma_turn
         problem = replace(
             part,
             photo=number[part.photo],
@@ -215,7 +216,8 @@ class Problem:
             R0=self.R0[photos],
             sigma_R=self.sigma_R[photos],
             velocity=self.velocity[photos],
-            sigma_turn=None if turns is None else turns[photos],
+            sigma_turn=None if self.sigma_turn is None else self.sigma_turn[photos],
+            turn0=None if self.turn0 is None else self.turn0[photos],
         )
         R, C, turn = state.R[photos], state.C[photos], state.turn[photos]
         return problem, State(R=R, C=C, K=state.K, X=state.X[points], turn=turn)

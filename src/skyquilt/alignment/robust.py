@@ -63,10 +63,13 @@ def prior_terms(problem: Problem, state: State) -> PriorTerms:
     dc, pc, cost_c = position_terms(problem, state)
     rotation, pr, cost_r = attitude_terms(problem, state)
     pk, dk = problem.free / problem.sigma_K**2, state.K - problem.K0
-    pt = np.zeros_like(state.turn)
+    pt, dt = (
+        np.zeros_like(state.turn),
+        state.turn - (0.0 if problem.turn0 is None else problem.turn0),
+    )
     if problem.sigma_turn is not None:
         pt += 1 / problem.sigma_turn[:, None] ** 2
-    cost = cost_c.sum() + cost_r.sum() + (pk * dk**2).sum() + (pt * state.turn**2).sum()
+    cost = cost_c.sum() + cost_r.sum() + (pk * dk**2).sum() + (pt * dt**2).sum()
     pull, common = pk * dk, None
     if problem.common is not None:
         off = problem.common.rows @ state.K.ravel() - problem.common.zero
@@ -81,7 +84,7 @@ def prior_terms(problem: Problem, state: State) -> PriorTerms:
     turning = ((pr * rotation)[:, None] @ R0_T)[:, 0]
     return PriorTerms(
         photo=photo,
-        photo_gradient=np.concatenate([turning, pc * dc, pt * state.turn], 1),
+        photo_gradient=np.concatenate([turning, pc * dc, pt * dt], 1),
         camera=pk,
         camera_gradient=pull,
         common=common,

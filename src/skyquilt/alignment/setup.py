@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.motion import velocities
+from skyquilt.alignment.motion import spins, velocities
 from skyquilt.alignment.problem import PART, READOUT, Problem, State
 from skyquilt.alignment.same_lens import same_lens
 from skyquilt.alignment.start import GROSS_DEG, UNKNOWN_YAW_DEG, Start, steered
@@ -83,6 +83,8 @@ class Setup:
     """
     in_space: bool = False
     """The first points are where rays meet near the ground plane, not on it."""
+    spin: tuple[Array, Array] | None = None
+    """Rates (n, 3) in rad/s at which cameras turn, and their deviations (n,): `motion.spins`."""
 
     def file_px(self, photo: NDArray[np.integer[Any]], px: Array) -> Array:
         """Converts sensor pixels to file pixels, or back. For turned files the two differ by a
@@ -92,10 +94,11 @@ class Setup:
             return px
         return turned_px(px, self.turned[photo], self.size[photo])
 
-    def moving_as(self, photos: Sequence[Photo], C: Array) -> "Setup":
-        """The same with the velocities that centres (n, 3) and capture times tell."""
+    def moving_as(self, photos: Sequence[Photo], state: State) -> "Setup":
+        """The same with the velocities and turns that poses and capture times tell."""
         members = [photos[m] for m in self.members.tolist()]
-        return replace(self, base=replace(self.base, velocity=velocities(members, C)))
+        base = replace(self.base, velocity=velocities(members, state.C))
+        return replace(self, base=base, spin=spins(members, state.R))
 
     def file_sign(self, photo: NDArray[np.int64]) -> Array:
         """(N, 1) factor that takes residuals from the sensor to the file."""

@@ -41,6 +41,8 @@ CLEARLY = 9.0
 """By how much the cost of cameras that stood still must be less than that of moving ones, as their
 positions and times have them: three deviations.
 """
+NO_SPIN = np.zeros(3), np.zeros(1)
+"""Rates in rad/s at which cameras turn, and their deviations, where nothing tells them."""
 FEWEST_POSITIONS, UNTOLD, SETTLING = 4, 7, 12
 """Positions that tell where a block lies; what they are asked for (place, scale, rotation); and
 rounds in which the weights of gross errors settle.
@@ -152,7 +154,11 @@ def weighed(
     rolls, many = _rolls(problem, state), _is_large(problem)
     if rolls:
         readout = np.abs(state.K[problem.camera, READOUT])
-        problem = replace(problem, sigma_turn=np.maximum(TURN_RAD_S * readout, 1e-9))
+        sigma, (rate, off) = TURN_RAD_S * readout, setup.spin or NO_SPIN
+        unsure = problem.sigma_K[problem.camera, READOUT] * np.linalg.norm(rate, axis=-1)
+        sigma = np.sqrt(sigma**2 + (off * readout) ** 2 + unsure**2)
+        state = spinning(problem, state, setup)
+        problem = replace(problem, sigma_turn=np.maximum(sigma, 1e-9), turn0=state.turn)
     if rolls and many:
         chosen = _places_of(problem, state)
         some, its = problem.among(chosen, state)
@@ -166,6 +172,13 @@ def weighed(
     if rolls and not many:
         return _standing(problem, state, keep.within("still"), near)
     return problem, state
+
+
+def spinning(problem: Problem, state: State, setup: Setup) -> State:
+    """The state with the turns of cameras while they expose as poses and times tell them."""
+    rate, _ = setup.spin or NO_SPIN
+    turn = rate * state.K[problem.camera, READOUT, None]
+    return replace(state, turn=np.broadcast_to(turn, state.turn.shape).copy())
 
 
 def _reweighed(
@@ -227,13 +240,14 @@ def _still(problem: Problem, state: State) -> tuple[Problem, State]:
     """The same with cameras that stand still while they expose."""
     K = state.K.copy()
     K[:, READOUT] = problem.K0[:, READOUT]
-    still = replace(problem, velocity=problem.velocity * 0.0)
+    still = replace(problem, velocity=problem.velocity * 0.0, turn0=None)
     return still, replace(state, K=K, turn=np.zeros_like(state.turn))
 
 
 def _turning(problem: Problem, state: State) -> bool:
     """Whether turns of the cameras explain more than chance would: a unit of the cost for each."""
-    steady, begin = replace(problem, sigma_turn=None), replace(state, turn=state.turn * 0.0)
+    turn = np.zeros_like(state.turn) if problem.turn0 is None else problem.turn0
+    steady, begin = replace(problem, sigma_turn=None), replace(state, turn=turn)
     without = adjust(steady, begin, iterations=15, tolerance=1e-4, damping=1e-6)
     return without.cost - robust_cost(problem, state) > state.turn.size
 

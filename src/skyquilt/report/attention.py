@@ -101,9 +101,9 @@ def _shutter(m: Mapping[str, Any]) -> Iterator[Sentence]:
             )
         elif source == "guess" and moved >= LEAST_PX:
             yield (
-                f"Nothing tells the readout of {plain(camera)}, whose shutter is rolling: a guess of"
-                f" {fixed(told.get('prior_ms'), 0)} ms was adjusted to {fixed(readout, 1)} \u00b1"
-                f" {fixed(told.get('sigma_ms'), 1)} ms, which moves places by up to"
+                f"Nothing tells the readout of {plain(camera)}, whose shutter is rolling: a guess"
+                f" of {fixed(told.get('prior_ms'), 0)} ms was adjusted to {fixed(readout, 1)}"
+                f" \u00b1 {fixed(told.get('sigma_ms'), 1)} ms, which moves places by up to"
                 f" {fixed(moved, 1)} px; --shutter-readout if you know better.",
                 "cameras",
             )
