@@ -47,6 +47,12 @@ CLIMBED = (
     " those from higher up"
 )
 
+FALSE_M = 1.0
+"""The ground of a map lies where the photo that it began with tells; where it lies further from
+there in m, the height of that photo proved false.
+"""
+FALSE = "the first photo told a false height: the map is begun again with the heights of the others"
+
 
 class InitialPose:
     """Places received photos from their metadata; photos without a position wait."""
@@ -135,6 +141,22 @@ class InitialPose:
         least = HIGHER * _above_m(self._first(known[0]).photo) if known else np.inf
         higher = [m for m in known if _above_m(m.photo) > least]
         return member in higher and 2 * len(higher) > len(known)
+
+    def from_false_height(self, member: Member) -> bool:
+        """Whether the map, which has few photos, began at the height of a photo that is not
+        believed any more, and this one tells a height.
+        """
+        frame, z = self.members.frame, float(member.prior.map_C[2])
+        if frame is None or frame.vertical_datum == "takeoff" or not np.isfinite(z):
+            return False
+        near = self.members.near[: bisect_right(self.members.near, member.id)]
+        if not near[:-1] or len(near) > FEW or member.id <= self._begun_at():
+            return False
+        first = self._first(self.members.by_id[near[0]])
+        if np.isfinite(first.prior.map_C[2]):
+            z = float(first.prior.map_C[2])
+        ground = float(self.ledger.meta("ground", 0.0))
+        return abs(z - _above_m(first.photo) - ground) > FALSE_M
 
     def _first(self, member: Member) -> Member:
         """The photo with which the map begins: the one around which it is begun again, or this

@@ -33,7 +33,7 @@ from skyquilt.live.drone_metadata import Metadata
 from skyquilt.live.events import MapEvents, Update
 from skyquilt.live.failures import MemberFailedError, concerning, of_the_system
 from skyquilt.live.inbox import Inbox
-from skyquilt.live.initial_pose import CLIMBED, InitialPose
+from skyquilt.live.initial_pose import CLIMBED, FALSE, InitialPose
 from skyquilt.live.ledger import DAMAGED, Ledger
 from skyquilt.live.links import LiveLinks
 from skyquilt.live.local_pose import LocalPose
@@ -335,6 +335,8 @@ class LiveMap:
             again = partial(self.initial_pose.begin_again, first)
         elif self.initial_pose.from_higher(first):
             again = partial(self.initial_pose.begin_again, first, CLIMBED)
+        elif self.initial_pose.from_false_height(first):
+            again = partial(self.initial_pose.begin_again, first, FALSE)
         if again is not None:
             self.background.stop()
             update = again()

@@ -13,7 +13,7 @@ from pyproj import Transformer
 
 from skyquilt.alignment.priors import empty_prior, photo_prior
 from skyquilt.alignment.setup import TURNED
-from skyquilt.live.doubled import Grounded, tell_doubled
+from skyquilt.live.doubled import LOOKED_BACK, DoubtedHeights, tell_doubled
 from skyquilt.live.failures import concerning
 from skyquilt.live.inbox import Inbox
 from skyquilt.live.ledger import DAMAGED, STAND_IN, Ledger
@@ -36,8 +36,6 @@ FAR_M = 100_000.0
 """A position farther than this from where the map began is not used: it is that of another flight,
 and the map's projection is bent there.
 """
-LOOKED_BACK = 300
-"""Photos of a camera by which it is told whether positions are rounded or repeat the one before."""
 COARSE = "coarse positions"
 """Name in the ledger of the number of photos that a note named last for that."""
 ON_MAP = ("placed", "refined")
@@ -112,7 +110,7 @@ class Members:
         self.near: list[int] = []
         """Numbers of the photos with a position near the place where the map began, ascending."""
         self._began = np.full(3, np.nan)
-        self._grounded = Grounded(ledger)
+        self._heights = DoubtedHeights(ledger)
         self._last = 0
         self._to_map: Transformer | None = None
         self._to_wgs: Transformer | None = None
@@ -168,11 +166,11 @@ class Members:
         tell_doubled(self.ledger, COARSE, coarse, lambda: [f"So far: {note}" for note in notes])
 
     def _prior(self, member: Member) -> Prior:
-        """The prior of a photo in the map's frame; a position far away is not used, nor a height
-        above take-off of a camera that tells none but zero.
+        """The prior of a photo in the map's frame; a position far away is not used, nor heights
+        that are doubted.
         """
         assert self.frame is not None
-        photo = self._grounded.doubted(member.photo)
+        photo = self._heights.doubted(member.id, member.photo)
         if self.distance_m(photo) > FAR_M:
             photo = replace(photo, position=None)
         return photo_prior(photo, self.frame, self._to_map)
@@ -243,10 +241,11 @@ class Members:
             self.block_of[member.id] = member.id
             self.blocks[member.id] = {member.id}
             new.append(member)
-        risen = self._grounded.look([m.photo for m in new])
-        for member in self.by_id.values() if risen and self.frame is not None else ():
-            if member.photo.camera_key in risen:
-                member.prior = self._prior(member)
+        latest = islice(reversed(self.by_id.values()), LOOKED_BACK + len(new))
+        risen, mended = self._heights.look({m.id: m.photo for m in latest}, len(new))
+        for m in self.by_id.values() if risen else [self.by_id[i] for i in mended]:
+            if self.frame is not None and (m.id in mended or m.photo.camera_key in risen):
+                m.prior = self._prior(m)
         if new and self.frame is not None:
             self._doubt_positions(new)
         return new
