@@ -14,12 +14,12 @@ from skyquilt.live.adjustment_schedule import KEY as SCHEDULE
 from skyquilt.live.drone_metadata import Metadata
 from skyquilt.live.events import MapEvents, Update
 from skyquilt.live.ledger import hit
-from skyquilt.live.members import FAR_M, Member, Queues, about_record
+from skyquilt.live.members import FAR_M, MOST_M, Member, Queues, about_record
 from skyquilt.live.photo_intake import BAND, OTHER_BAND, of_other_band
 from skyquilt.live.redraw_queue import RedrawQueue
 from skyquilt.model.photo import Photo
 from skyquilt.ortho.ground import round_gsd
-from skyquilt.outside import whole
+from skyquilt.outside import real, whole
 from skyquilt.photos.implausible_positions import on_sphere
 
 FEW = 10
@@ -47,9 +47,9 @@ CLIMBED = (
     " those from higher up"
 )
 
-FALSE_M = 1.0
-"""The ground of a map lies where the photo that it began with tells; where it lies further from
-there in m, the height of that photo proved false.
+BEGAN_M, FALSE_M = "begun at height", 10.0
+"""Name in the ledger of the height that the photo told with which the map began; where that photo
+tells another one by now, further from it in m, the height proved false.
 """
 FALSE = "the first photo told a false height: the map is begun again with the heights of the others"
 
@@ -152,11 +152,9 @@ class InitialPose:
         near = self.members.near[: bisect_right(self.members.near, member.id)]
         if not near[:-1] or len(near) > FEW or member.id <= self._begun_at():
             return False
-        first = self._first(self.members.by_id[near[0]])
-        if np.isfinite(first.prior.map_C[2]):
-            z = float(first.prior.map_C[2])
-        ground = float(self.ledger.meta("ground", 0.0))
-        return abs(z - _above_m(first.photo) - ground) > FALSE_M
+        first = self._first(self.members.by_id[near[0]]).prior.map_C[2]
+        began = real(self.ledger.meta(BEGAN_M), -MOST_M, MOST_M)
+        return began is not None and abs((first if np.isfinite(first) else z) - began) > FALSE_M
 
     def _first(self, member: Member) -> Member:
         """The photo with which the map begins: the one around which it is begun again, or this
@@ -256,6 +254,8 @@ class InitialPose:
         gsd = asked / 100 if asked else round_gsd(3 * above / photo.focal.px)
         ground = 0.0 if frame.vertical_datum == "takeoff" else float(prior.map_C[2]) - above
         ground = ground if np.isfinite(ground) else 0.0
+        with self.ledger.change():
+            self.ledger.put_meta(BEGAN_M, float(np.nan_to_num(prior.map_C[2])))
         self.fix(gsd, above, ground, warning)
 
     def fix(self, gsd: float, above: float, ground: float, warning: str) -> None:
