@@ -1,4 +1,6 @@
-"""Photos of a growing map yield to much finer ones where its pixels show the difference."""
+"""Photos of a growing map yield to much finer ones where its pixels show the difference; of many,
+those are drawn that show a place best.
+"""
 
 import io
 
@@ -7,11 +9,16 @@ import piexif
 import pytest
 from PIL import Image
 
-from skyquilt.imaging.views import make_views
-from skyquilt.live.coarse_views import yielding_to_finer
+from skyquilt.geometry.frames import cam_R_map_from_angles
+from skyquilt.imaging.nodes import View, project_nodes
+from skyquilt.imaging.views import footprint, make_views
+from skyquilt.live.coarse_views import showing_best, yielding_to_finer
 from skyquilt.live.live_map import LiveMap
 from skyquilt.live.settings import LiveSettings
-from skyquilt.live.tile_drawing import WHOLE
+from skyquilt.live.tile_drawing import MOST_VIEWS, WHOLE
+from skyquilt.model.camera import Camera
+from skyquilt.model.poses import Pose
+from skyquilt.model.raster import Grid
 from skyquilt.ortho.blend import Feather
 from skyquilt.ortho.tie_surface import level
 from tests.live.conftest import fed
@@ -31,6 +38,38 @@ def test_a_higher_photo_yields_in_the_middle_of_its_picture():
     assert room[1] < 0 < min(room[0], room[2])
     same = yielding_to_finer(views, sizes, level(0.0), 1.1 * coarse)  # the map shows it no finer
     assert all(a is b for a, b in zip(same, views, strict=True))
+
+
+def orbit(photos, radius, height):
+    """Views of photos around a place at the origin, all looking at it from above ground at zero."""
+    camera = Camera(width=960, height=720, focal=800.0, cx=479.5, cy=359.5)
+    tilt = np.degrees(np.arctan2(radius, height))
+    views = []
+    for k, at in enumerate(np.linspace(0, 360, photos, endpoint=False)):
+        C = [radius * np.sin(np.radians(at)), radius * np.cos(np.radians(at)), height]
+        pose = Pose(cam_R_map=cam_R_map_from_angles(at + 180, tilt, 0.0), map_C=np.array(C))
+        outline = footprint(camera, pose, level(0.0))
+        views.append(View(photo=k, camera=camera, pose=pose, footprint=outline))
+    return views
+
+
+@pytest.mark.parametrize(("radius", "north"), [(75.0, 110.0), (75.0, 20.0), (5.0, 40.0)])
+def test_a_tile_is_drawn_from_the_photos_that_show_its_places_best(radius, north):
+    """The nearest ones of an orbit look away from the ground below them: it stayed empty."""
+    views = orbit(60, radius, 75.0)
+    grid = Grid(gsd=0.2, west=-25.0, north=north, width=256, height=256)
+    some = showing_best(views, grid, level(0.0), MOST_VIEWS)
+    assert len(some) == MOST_VIEWS and [v.photo for v in some] == sorted(v.photo for v in some)
+    x, y = np.meshgrid(np.linspace(-20, 20, 12), np.linspace(north - 5, north - 45, 12))
+    best = []
+    for among in (views, some):
+        nodes = [project_nodes(v, x, y, np.zeros_like(x)) for v in among]
+        best.append(np.min([np.where(n.seen, n.score, np.inf) for n in nodes], axis=0))
+    assert np.isfinite(best[0]).mean() > 0.9
+    assert np.array_equal(np.isfinite(best[0]), np.isfinite(best[1]))
+    seen = np.isfinite(best[0])
+    assert (best[1][seen] < 1.2 * best[0][seen] + 0.05).all()  # nearly as from straight above
+    assert showing_best(views[:24], grid, level(0.0), MOST_VIEWS) == views[:24]
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ from skyquilt.imaging.grey import shrink
 from skyquilt.imaging.nodes import View
 from skyquilt.imaging.view_limits import COARSEST, ViewLimits, limits_for
 from skyquilt.imaging.views import footprint
-from skyquilt.live.coarse_views import yielding_to_finer
+from skyquilt.live.coarse_views import showing_best, yielding_to_finer
 from skyquilt.live.failures import concerning
 from skyquilt.live.ledger import hit
 from skyquilt.live.members import Member
@@ -386,15 +386,12 @@ class Canvas:
             for i in sorted(self._by_tile.get(address, ()))
             if (v := self._views.get(i)) is not None
         ]
-        if len(inside) > MOST_VIEWS:
-            middle = np.array([grid.west + SIDE * self.gsd / 2, grid.north - SIDE * self.gsd / 2])
-            inside.sort(key=lambda v: float(np.hypot(*(v.pose.map_C[:2] - middle))))
-            inside = sorted(inside[:MOST_VIEWS], key=lambda v: v.photo)
         if not inside:
             return None
         west, south, east, north = grid.bounds
         rim = RIM * self.heights.cell
         surface = self.surface((west - rim, south - rim, east + rim, north + rim))
+        inside = showing_best(inside, grid, surface, MOST_VIEWS)
         surface = gentle(surface, np.array([v.pose.map_C for v in inside]))
         values = measured(self.members[inside[0].photo])
         return Composer(
