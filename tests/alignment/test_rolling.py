@@ -203,7 +203,9 @@ def test_cameras_turn_while_frames_of_a_clip_are_taken_as_from_frame_to_frame():
     fast = np.linalg.norm(true, axis=1) > np.radians(15)
     assert 3 <= fast.sum() < len(flown) - 3
     apart = np.linalg.norm(rate - true, axis=1)
-    assert (apart[1:-1] < np.maximum(3 * off[1:-1], np.radians(4))).all()
+    assert (apart[1:-1] < np.maximum(3 * off[1:-1], np.radians(6))).all()
+    swaying = np.linalg.norm(rate, axis=1) == 0
+    assert swaying.any() and not off[swaying].any() and not (swaying & fast).any()
     assert np.median(apart[fast]) < 0.2 * np.median(np.linalg.norm(true[fast], axis=1))
     for rare in (timed(flown)[::3], [replace(p, time=None) for p in timed(flown)]):
         rate, off = spins(rare, R[: len(rare)])  # more than two seconds apart, or without times

@@ -26,6 +26,8 @@ LEAST_GAP_S, SPUN_APART_S = 0.05, 2.0
 """Photos nearer to one another than this in s have no rate; those further apart than the second do
 not tell how fast the camera turned at each.
 """
+SWAYS_RAD_S = np.radians(5.0)
+"""Slower turns are those of a camera that sways, whose rate changes from moment to moment."""
 HOVERS = 0.3
 """A drone that reports less than this share of its mean speed slows down for its photos."""
 FEWEST_HEADED, MOST_ALIKE, AMBIGUOUS_DEG = 4, 0.8, 20.0
@@ -73,7 +75,7 @@ def spins(photos: Sequence[Photo], R: Array) -> tuple[Array, Array]:
     """Rates (n, 3) in rad/s at which cameras with rotations R (n, 3, 3) from map to camera turn
     about their axes while photos are taken, as frames of a clip do where the drone turns, and by
     how much each may be off (n,): by the turns from the photo before and to the one after. Zero
-    where no photo was taken so near in time.
+    where no photo was taken so near in time, and where they are slow.
     """
     rate, off, time = np.zeros((len(photos), 3)), np.zeros(len(photos)), seconds(photos)
     for order in _in_order(photos, time):
@@ -86,7 +88,8 @@ def spins(photos: Sequence[Photo], R: Array) -> tuple[Array, Array]:
             if known:
                 rate[i] = np.mean(known, axis=0)
                 off[i] = np.linalg.norm(known[0] - (known[1] if known[1:] else 0.0)) / 2
-    return rate, off
+    fast = np.linalg.norm(rate, axis=1) > SWAYS_RAD_S
+    return np.where(fast[:, None], rate, 0.0), np.where(fast, off, 0.0)
 
 
 def _in_order(photos: Sequence[Photo], time: Array) -> Iterator[NDArray[np.int64]]:
