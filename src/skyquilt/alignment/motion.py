@@ -5,9 +5,9 @@ A rolling shutter exposes the rows of a photo one after the other while the came
 
 from collections.abc import Callable, Iterator, Sequence
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from skyquilt.geometry.frames import angle_difference_deg, commonest_deg
 from skyquilt.model.photo import Photo
@@ -80,9 +80,10 @@ def spins(photos: Sequence[Photo], R: Array) -> tuple[Array, Array]:
     rate, off, time = np.zeros((len(photos), 3)), np.zeros(len(photos)), seconds(photos)
     for order in _in_order(photos, time):
         gap = np.diff(time[order])
-        leg = Rotation.from_matrix(R[order[1:]] @ np.swapaxes(R[order[:-1]], 1, 2)).as_rotvec()
-        near = (gap > LEAST_GAP_S) & (gap < SPUN_APART_S)
-        leg[near] /= gap[near, None]
+        near, leg = (gap > LEAST_GAP_S) & (gap < SPUN_APART_S), np.zeros((len(gap), 3))
+        for k in np.flatnonzero(near).tolist():
+            turned = R[order[k + 1]] @ R[order[k]].T
+            leg[k] = np.asarray(cv2.Rodrigues(turned)[0]).ravel() / gap[k]
         for k, i in enumerate(order):
             known = [leg[n] for n in (k - 1, k) if 0 <= n < len(leg) and near[n]]
             if known:
