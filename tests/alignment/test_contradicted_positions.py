@@ -10,6 +10,7 @@ from skyquilt.alignment.contradicted_positions import (
     loose_warnings,
     position_warnings,
 )
+from skyquilt.alignment.false_heights import UNUSED
 from tests.alignment.surveys import alignment, prior
 
 LINES = np.array([(20.0 * (i % 5), 30.0 * (i // 5), 60.0) for i in range(20)])
@@ -86,6 +87,8 @@ def test_photos_that_are_enlarged_by_other_factors_are_told(factors, datum):
     assert "zoom" in told and "DigitalZoomRatio" in told
     number = int(told.split()[0])
     assert number in [int((each >= f).sum()) for f in factors[1:]]
+    explained = replace(block(seen), notes=(f"The heights of 10 of 20 photos lie 14 m. {UNUSED}",))
+    assert enlargement_warnings(told_at(places), explained) == []
 
 
 def test_heights_that_are_told_drift_or_are_few_are_no_zoom():

@@ -48,7 +48,7 @@ def test_heights_that_most_others_contradict_are_not_used(false, by_m, seed):
 def test_heights_with_errors_of_receivers_and_barometers_are_used(sigma):
     noise = noisy(20, sigma)
     drift = np.linspace(0, 40, 20) - 20
-    flights = np.repeat([0.0, 12.0], 10)
+    flights = np.repeat([0.0, 7.0], 10)
     for heights in (noise, noise + drift, noise + flights):
         case = told_at(heights, sigma, 20.0)
         assert outvoted_heights(*case) is None
@@ -69,10 +69,12 @@ def test_those_that_know_less_may_differ_more():
 
 
 @pytest.mark.parametrize(("second", "third"), [(10, 20), (4, 20), (15, 20), (8, 14)])
-@pytest.mark.parametrize("by_m", [-40.0, 100.0])
-def test_heights_above_several_take_off_points_count_from_that_of_most_photos(second, third, by_m):
+@pytest.mark.parametrize(("by_m", "sigma"), [(-40.0, 3.0), (100.0, 3.0), (12.0, 1.0)])
+def test_heights_above_several_take_off_points_count_from_that_of_most_photos(
+    second, third, by_m, sigma
+):
     """Of equally many, from the first one."""
-    heights = noisy(20)
+    heights = noisy(20, sigma)
     heights[second:] += by_m
     heights[third:] += by_m
     parts = [range(second), range(second, third), range(third, 20)]
@@ -83,6 +85,23 @@ def test_heights_above_several_take_off_points_count_from_that_of_most_photos(se
     assert kept == list(max(parts, key=len))
     assert "take-off point" in told.note
     assert height_warnings(priors, replace(found, notes=(told.note,))) == []
+
+
+@pytest.mark.parametrize("kind", ["drift", "back", "small", "scattered"])
+def test_heights_above_one_take_off_point_are_used(kind):
+    """Also where a barometer drifts and is set to zero again, or errs by metres."""
+    heights = noisy(20, 3.0 if kind == "scattered" else 0.5)
+    if kind == "drift":
+        heights += np.linspace(0, 25, 20)
+    if kind == "back":
+        heights[:12] += np.linspace(0, 15, 12)
+    if kind == "small":
+        heights[10:] += 6
+    if kind == "scattered":
+        heights[10:] += 12
+    found, names, priors = told_at(heights, lifted_m=float(heights.mean()) - 60)
+    found = replace(found, frame=replace(found.frame, vertical_datum="takeoff"))
+    assert outvoted_heights(found, names, priors) is None
 
 
 @pytest.mark.parametrize("by_m", [-440.0, 60.0])

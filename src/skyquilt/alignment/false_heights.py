@@ -26,6 +26,10 @@ occur, as of a barometer that drifts, and nobody is outvoted.
 """
 APART_M = 20.0
 """Receivers and barometers err by metres; so far apart, heights are wrong in another way."""
+STEP_M = 8.0
+"""The same of heights above take-off that all change by one step between two photos, if it is more
+than `AGREE` times what they scatter by beside it: errors come and go, or grow.
+"""
 UNUSED = "These heights are not used."
 """Words of the note by which an alignment tells that."""
 MEANT = 2.0
@@ -63,16 +67,20 @@ def _majority(off: Numbers, stated: Numbers) -> NDArray[np.bool_] | None:
     return np.asarray(agree)
 
 
-def _flights(off: Numbers, stated: Numbers) -> NDArray[np.bool_] | None:
+def _flights(off: Numbers) -> NDArray[np.bool_] | None:
     """Which differences are those of the flight with most photos, of equally many the first one,
     where flights one after the other have heights above take-off points of their own. None where
     they have not.
     """
     order = np.argsort(off)
-    wide = np.diff(off[order]) > max(APART_M, AGREE * float(np.median(stated)))
+    gap = np.diff(off[order])
+    wide = gap > STEP_M
     group = np.empty(len(off), np.int64)
     group[order] = np.cumsum(np.r_[False, wide])
     if not wide.any() or np.count_nonzero(np.diff(group)) != wide.sum():
+        return None
+    middle = np.array([np.median(off[group == k]) for k in range(wide.sum() + 1)])
+    if gap[wide].min() < AGREE * float(np.median(np.abs(off - middle[group]))):
         return None
     count = np.bincount(group)[group]
     return np.asarray(group == group[np.argmax(count)])
@@ -88,14 +96,15 @@ def outvoted_heights(
     own, off, stated = _differences(found, priors)
     if len(own) < FEWEST:
         return None
-    flights = _flights(off, stated) if found.frame.vertical_datum == "takeoff" else None
+    flights = _flights(off) if found.frame.vertical_datum == "takeoff" else None
     agree = _majority(off, stated) if flights is None else flights
     if agree is None or agree.all():
         return None
     middle = float(off[agree].mean())
     apart = float(np.median(np.abs(off[~agree] - middle)))
     errs = np.hypot(off[agree].std(), np.median(stated)) / np.sqrt(agree.sum())
-    if apart < APART_M or abs(middle) < MEANT * errs:
+    least = APART_M if flights is None else STEP_M
+    if apart < least or abs(middle) < MEANT * errs:
         return None
     out = list(priors)
     false = [i for i, a in zip(own, agree.tolist(), strict=True) if not a]
