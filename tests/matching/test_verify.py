@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from skyquilt.geometry.frames import cam_R_map_from_angles
@@ -65,6 +65,7 @@ def verified(pa, pb, *, others=0, **options):
     st.floats(0.75, 1.3),
     st.floats(0, 0.5),
 )
+@example(184, 47.0, 0.0, 1.259765625, 0.296875)  # an assertion of OpenCV fails there
 def test_links_of_tilted_views_of_rolling_ground(seed, yaw_a, yaw_b, ratio, outliers):
     pa, pb, right = view_pair(seed, yaw=(yaw_a, yaw_b), height=(1.0, ratio), outliers=outliers)
     link = verified(pa, pb)
