@@ -348,8 +348,8 @@ def _nowhere(start: Start) -> dict[int, str]:
     of = "the largest block" if known[0] == blocks[0] else "those that positions place"
     return {
         i: f"it is linked with {len(block) - 1} other photos, but not with the {len(known[0])} of"
-        f" {of}, and without a usable position its place is not known; map these"
-        " by themselves"
+        f" {of}, and without a usable position its place is not known;"
+        " map these by themselves"
         for block in lost
         for i in block
     }

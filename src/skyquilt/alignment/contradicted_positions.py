@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.enlarged import heights_above_ground
-from skyquilt.alignment.false_heights import UNUSED, height_warnings
+from skyquilt.alignment.false_heights import height_warnings, outvoted
 from skyquilt.alignment.similarity_graph import fit_similarity
 from skyquilt.alignment.start import ground_of
 from skyquilt.model.poses import Alignment, Prior
@@ -159,9 +159,7 @@ def enlargement_warnings(priors: Sequence[Prior], alignment: Alignment) -> list[
     Heights that drift have no gaps, and an offset of all heights is none. Where some heights were
     found to be false and told, they explain it.
     """
-    if alignment.frame.crs is None or not len(alignment.ties.xyz):
-        return []
-    if any(UNUSED in note for note in alignment.notes):
+    if alignment.frame.crs is None or not len(alignment.ties.xyz) or outvoted(alignment):
         return []
     found, told = heights_above_ground(alignment, priors)
     out = list[str]()

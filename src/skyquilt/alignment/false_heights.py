@@ -123,10 +123,15 @@ def outvoted_heights(
     return FalseHeights(priors=tuple(out), note=note)
 
 
+def outvoted(alignment: Alignment) -> bool:
+    """Whether it tells that some heights are not used."""
+    return any(UNUSED in note for note in alignment.notes)
+
+
 def height_warnings(priors: Sequence[Prior], alignment: Alignment) -> list[str]:
     """A sentence where reported heights contradict one another, and no majority agrees."""
     own, off, stated = _differences(alignment, priors)
-    if len(own) < FEWEST or any(UNUSED in note for note in alignment.notes):
+    if len(own) < FEWEST or outvoted(alignment):
         return []
     apart, usual = float(np.median(np.abs(off - np.median(off)))), float(np.median(stated))
     if apart <= max(AGREE * usual, APART_M / 2):

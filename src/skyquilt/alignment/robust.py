@@ -63,10 +63,8 @@ def prior_terms(problem: Problem, state: State) -> PriorTerms:
     dc, pc, cost_c = position_terms(problem, state)
     rotation, pr, cost_r = attitude_terms(problem, state)
     pk, dk = problem.free / problem.sigma_K**2, state.K - problem.K0
-    pt, dt = (
-        np.zeros_like(state.turn),
-        state.turn - (0.0 if problem.turn0 is None else problem.turn0),
-    )
+    pt = np.zeros_like(state.turn)
+    dt = state.turn if problem.turn0 is None else state.turn - problem.turn0
     if problem.sigma_turn is not None:
         pt += 1 / problem.sigma_turn[:, None] ** 2
     cost = cost_c.sum() + cost_r.sum() + (pk * dk**2).sum() + (pt * dt**2).sum()
