@@ -4,7 +4,7 @@ many. What is doubted of heights as they come.
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import astuple, replace
 from itertools import islice
 
 from skyquilt.live.ledger import Ledger
@@ -101,4 +101,9 @@ class DoubtedHeights:
         self._changed |= now
         notes = [f"So far: {note}" for note in (*zero, *signs)]
         tell_doubled(self._ledger, MENDED, len(now), lambda: notes)
-        return {i for i in before | now if before.get(i, i) != now.get(i, i)}
+        same = {i for i in before.keys() & now if _values(before[i]) == _values(now[i])}
+        return (before.keys() | now.keys()) - same
+
+
+def _values(position: GeoPosition | None) -> tuple[object, ...] | None:
+    return astuple(position) if position else None
