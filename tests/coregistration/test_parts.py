@@ -355,3 +355,34 @@ def test_another_place_need_have_no_patch_in_common(scene):
     once = b.fields.copy()
     once[:, -int(0.4 * b.shape[1]) :] = 0
     assert Repeats()(a, replace(b, fields=once), at, Agree()) is None
+
+
+def roofs(seed):
+    """(256, 320) roofs in a grid, of which a fifth is missing, in brightness of their own."""
+    rng = np.random.default_rng(seed)
+    ground = cv2.GaussianBlur(rng.normal(size=(256, 320)), (0, 0), 2.0)
+    picture = 100 + 8 * ground / ground.std()
+    for y in range(8, 250, 44):
+        for x in range(8, 310, 52):
+            if rng.random() < 0.8:
+                level = float(rng.uniform(20, 230))
+                cv2.rectangle(picture, (x, y), (x + 36, y + 28), level, -1)
+    return np.clip(cv2.GaussianBlur(picture, (0, 0), 0.7), 0, 255).astype(np.uint8)
+
+
+def test_a_grid_with_gaps_of_another_place_is_refused():
+    """At one of many periods the gaps of both lie on each other by chance: the second best one
+    correlates to 0.75 of it, and patches do not prefer it.
+    """
+    one, other = roofs(3), roofs(1003)
+    one, negative, other = (usable(Picture(values=v)) for v in (one, 255 - one, other))
+    pyramid = Pyramid(a=one, b=other, sides=(256.0,))
+    period = 52 * pyramid.at(0)[0].small_S_full[0, 0]  # of 25, here they fit best
+    start = np.array([[1, 0, period], [0, 1, 0], [0, 0, 1.0]])
+    best = SubpixelRefinement(steps=3)(*pyramid.at(0), start)
+    assert Agree()(*pyramid.at(0), best.b_H_a).surprise > 5
+    assert Repeats(least=0.8499)(*pyramid.at(0), best.b_H_a, Agree()) is None
+    refused = Decide()(pyramid, [best])
+    assert not refused and "the pictures repeat" in refused.reason
+    own = Pyramid(a=one, b=negative, sides=(256.0,))
+    assert Decide()(own, [SubpixelRefinement()(*own.at(0), np.eye(3))])

@@ -71,7 +71,7 @@ class Decide:
     """Weight of finer structure, the rest is that of coarser one. Alone it is the more exact where
     the bands are alike, and the less exact where they are not, and its error is less certain.
     """
-    version: ClassVar[int] = 7
+    version: ClassVar[int] = 8
 
     def __call__(
         self,
@@ -95,8 +95,8 @@ class Decide:
             return _refused(_doubt(agreement, self.least_surprise), agreement, fit)
         if not told and agreement.beside_edges < self.least_beside:
             return _refused(_straight(agreement, self.least_beside), agreement, fit)
-        rival = self.repeats(*pyramid.at(pyramid.last), fit.b_H_a, self.agree)
-        if rival is not None and np.hypot(*rival.shift) <= reach:
+        rival = self.repeats(*pyramid.at(pyramid.last), fit.b_H_a, self.agree, reach)
+        if rival is not None:
             return _refused(_repeated(rival, pyramid), agreement, fit)
         return self._finished(pyramid, fit, agreement)
 

@@ -39,11 +39,19 @@ class Repeats:
 
     Registrations of 34 pairs, each changed in eight ways, correlate elsewhere to 0.77 of their own
     correlation at most; trees in a grid one period away to 0.74 where each stands a little off it,
-    and to 0.92 and more where nothing tells the periods apart.
+    and to 0.92 and more where nothing tells the periods apart. Roofs and tanks of other places, in
+    grids with gaps, to 0.63 to 0.81: of hundreds of periods one has its gaps at the same places by
+    chance.
     """
 
     nearly: float = 0.85
-    """Correlation from which another place is a rival, as a share of that at the registered one."""
+    """Correlation of a rival from which the full lead is required, as a share of that at the
+    registered place.
+    """
+    least: float = 0.5
+    """The same from which another place is a rival at all; in between, the lead that is required
+    rises evenly from none.
+    """
     clear: float = 5.0
     """Lead from which the registered place is the right one all the same. With nothing that tells
     periods apart it was 3.7 at most.
@@ -54,40 +62,57 @@ class Repeats:
     """Other places that are tried."""
     fewest: int = 4
     """Patches that both places must have in common, or each of them."""
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
 
-    def __call__(self, a: Orientation, b: Orientation, b_H_a: Matrix, agree: Agree) -> Rival | None:
-        """The strongest rival of a transform in px of this resolution; None if there is none."""
+    def __call__(
+        self,
+        a: Orientation,
+        b: Orientation,
+        b_H_a: Matrix,
+        agree: Agree,
+        reach: float = float("inf"),
+    ) -> Rival | None:
+        """The strongest rival of a transform in px of this resolution, at most `reach` px away;
+        None if there is none.
+        """
         starts, found = list(self._places(a, b, b_H_a, agree)), []
         here = _correlations(a, b, b_H_a, agree) if starts else {}
         middle = np.array([b.shape[1] / 2, b.shape[0] / 2, 1.0])
-        for start in starts:
+        for share, start in starts:
             fit = SubpixelRefinement(steps=3)(a, b, start)
             moved = fit.b_H_a @ np.linalg.inv(b_H_a) @ middle
             shift = moved[:2] / moved[2] - middle[:2]
-            if np.hypot(*shift) > _own(b.shape, agree) / 2:
+            if _own(b.shape, agree) / 2 < np.hypot(*shift) <= reach:
                 lead = self._lead(here, _correlations(a, b, fit.b_H_a, agree))
-                if lead is not None and lead < self.clear:
+                if lead is not None and lead < self._required(share):
                     found.append(Rival(shift=(float(shift[0]), float(shift[1])), lead=lead))
         return min(found, key=lambda r: r.lead, default=None)
 
+    def _required(self, share: float) -> float:
+        """Lead over a rival whose correlation is such a share of that at the registered place."""
+        return self.clear * min((share - self.least) / (self.nearly - self.least), 1.0)
+
     def _places(
         self, a: Orientation, b: Orientation, b_H_a: Matrix, agree: Agree
-    ) -> Iterator[Matrix]:
-        """Shifts of the transform to other peaks of the correlation that are nearly as high."""
+    ) -> Iterator[tuple[float, Matrix]]:
+        """Other peaks of the correlation, as a share of that at the transform, and the transform
+        shifted to each.
+        """
         z, _ = at_all_shifts(a, b, b_H_a, self.overlap)
         shape = z.shape
         near = np.arange(-agree.near, agree.near + 1)
-        least = self.nearly * float(z[np.ix_(near, near)].max())
+        here = float(z[np.ix_(near, near)].max())
         around = np.arange(-_own(b.shape, agree), _own(b.shape, agree) + 1)
         z[np.ix_(around, around)] = 0
         for _ in range(self.most):
             y, x = divmod(int(z.argmax()), shape[1])
-            if z[y, x] < least or z[y, x] <= 0:
+            if z[y, x] <= max(self.least * here, 0.0):
                 return
+            share = float(z[y, x]) / max(here, 1e-9)
             # the warped a at p + (x, y) looks like b at p: a belongs (x, y) further back
             back = [x - shape[1] * (x > shape[1] / 2), y - shape[0] * (y > shape[0] / 2)]
-            yield np.array([[1, 0, -back[0]], [0, 1, -back[1]], [0, 0, 1.0]]) @ b_H_a
+            moved = np.array([[1, 0, -back[0]], [0, 1, -back[1]], [0, 0, 1.0]]) @ b_H_a
+            yield share, moved
             z[np.ix_((y + around) % shape[0], (x + around) % shape[1])] = 0
 
     def _lead(self, here: Correlations, there: Correlations) -> float | None:
