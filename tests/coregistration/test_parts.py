@@ -381,7 +381,7 @@ def test_a_grid_with_gaps_of_another_place_is_refused():
     start = np.array([[1, 0, period], [0, 1, 0], [0, 0, 1.0]])
     best = SubpixelRefinement(steps=3)(*pyramid.at(0), start)
     assert Agree()(*pyramid.at(0), best.b_H_a).surprise > 5
-    assert Repeats(least=0.8499)(*pyramid.at(0), best.b_H_a, Agree()) is None
+    assert Repeats(partly=0.85, undisputed=0.0)(*pyramid.at(0), best.b_H_a, Agree()) is None
     refused = Decide()(pyramid, [best])
     assert not refused and "the pictures repeat" in refused.reason
     own = Pyramid(a=one, b=negative, sides=(256.0,))

@@ -95,7 +95,8 @@ class Decide:
             return _refused(_doubt(agreement, self.least_surprise), agreement, fit)
         if not told and agreement.beside_edges < self.least_beside:
             return _refused(_straight(agreement, self.least_beside), agreement, fit)
-        rival = self.repeats(*pyramid.at(pyramid.last), fit.b_H_a, self.agree, reach)
+        agreeing = len(agreement.px) / max(agreement.patches, 1)
+        rival = self.repeats(*pyramid.at(pyramid.last), fit.b_H_a, self.agree, reach, agreeing)
         if rival is not None:
             return _refused(_repeated(rival, pyramid), agreement, fit)
         return self._finished(pyramid, fit, agreement)

@@ -40,21 +40,28 @@ class Repeats:
     Registrations of 34 pairs, each changed in eight ways, correlate elsewhere to 0.77 of their own
     correlation at most; trees in a grid one period away to 0.74 where each stands a little off it,
     and to 0.92 and more where nothing tells the periods apart. Roofs and tanks of other places, in
-    grids with gaps, to 0.63 to 0.81: of hundreds of periods one has its gaps at the same places by
-    chance.
+    grids with gaps, do so to 0.63 to 0.81: of hundreds of periods one has its gaps at the same
+    places by chance. There fewer patches agree than at the true place, where no gap contradicts.
     """
 
     nearly: float = 0.85
-    """Correlation of a rival from which the full lead is required, as a share of that at the
-    registered place.
+    """Correlation of a rival from which `clear` is required, as a share of that at the registered
+    place.
     """
+    partly: float = 0.75
+    """The same from which `preferred` is required."""
     least: float = 0.5
-    """The same from which another place is a rival at all; in between, the lead that is required
-    rises evenly from none.
-    """
+    """The same from which another place is a rival at all, where patches disagree."""
     clear: float = 5.0
     """Lead from which the registered place is the right one all the same. With nothing that tells
     periods apart it was 3.7 at most.
+    """
+    preferred: float = 1.0
+    """Lead with which patches prefer the registered place at all."""
+    undisputed: float = 0.7
+    """Share of patches that agree, below which the lead required of any rival rises evenly from
+    none at `least` to `clear`. It was 0.65 at most at other places, of tanks at the true one 0.92
+    at least. Where a rival is none, as in most pictures, no such share is asked for.
     """
     overlap: float = 0.5
     """Least overlap of another place, as a share of that of the registered one."""
@@ -71,9 +78,10 @@ class Repeats:
         b_H_a: Matrix,
         agree: Agree,
         reach: float = float("inf"),
+        agreeing: float = 1.0,
     ) -> Rival | None:
         """The strongest rival of a transform in px of this resolution, at most `reach` px away;
-        None if there is none.
+        None if there is none. `agreeing`: share of patches that agree with the transform.
         """
         starts, found = list(self._places(a, b, b_H_a, agree)), []
         here = _correlations(a, b, b_H_a, agree) if starts else {}
@@ -84,13 +92,18 @@ class Repeats:
             shift = moved[:2] / moved[2] - middle[:2]
             if _own(b.shape, agree) / 2 < np.hypot(*shift) <= reach:
                 lead = self._lead(here, _correlations(a, b, fit.b_H_a, agree))
-                if lead is not None and lead < self._required(share):
+                if lead is not None and lead < self._required(share, agreeing):
                     found.append(Rival(shift=(float(shift[0]), float(shift[1])), lead=lead))
         return min(found, key=lambda r: r.lead, default=None)
 
-    def _required(self, share: float) -> float:
+    def _required(self, share: float, agreeing: float) -> float:
         """Lead over a rival whose correlation is such a share of that at the registered place."""
-        return self.clear * min((share - self.least) / (self.nearly - self.least), 1.0)
+        if share >= self.nearly:
+            return self.clear
+        least = self.preferred if share >= self.partly else -float("inf")
+        if agreeing >= self.undisputed:
+            return least
+        return max(least, self.clear * (share - self.least) / (self.nearly - self.least))
 
     def _places(
         self, a: Orientation, b: Orientation, b_H_a: Matrix, agree: Agree
