@@ -11,6 +11,7 @@ import pytest
 import rasterio
 import tifffile
 
+from skyquilt.alignment.nothing_shown import CLOSED
 from skyquilt.errors import RefusedError
 from skyquilt.geometry.camera import project, rays
 from skyquilt.geometry.frames import angle_deg, cam_R_map_from_angles
@@ -19,7 +20,6 @@ from skyquilt.model.event import Note, Result
 from skyquilt.ortho.exposure import NEUTRAL
 from skyquilt.settings import MosaicSettings
 from skyquilt.thermal import workflow
-from skyquilt.thermal.closed_shutter import CLOSED
 from skyquilt.thermal.workflow import iter_thermal
 
 HEAT = replace(Camera.ideal(width=320, height=256, focal=400.0), k1=-0.2)

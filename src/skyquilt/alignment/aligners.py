@@ -1,6 +1,6 @@
 """The aligners of every survey: `bundle`, `pose`, `position`, and `auto`, which chooses."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import ClassVar
@@ -17,6 +17,7 @@ from skyquilt.alignment.determined import ground_places
 from skyquilt.alignment.foreign_positions import usable_positions
 from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.motion import FEWEST_HEADED, headings_by_course
+from skyquilt.alignment.nothing_shown import CLOSED, ONE_TONE, one_tone, shutter_closed
 from skyquilt.alignment.oblique import tilted, without_photos
 from skyquilt.alignment.outcome import of_placed
 from skyquilt.alignment.pose import ByMetadata, ByPose
@@ -26,7 +27,6 @@ from skyquilt.geometry.camera import shown
 from skyquilt.geometry.frames import angles_from_cam_R_map, cam_R_map_from_angles
 from skyquilt.model.camera import Camera
 from skyquilt.model.features import Features
-from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, Pose
 from skyquilt.photos.implausible_positions import raised
 from skyquilt.photos.side_rows import sentence_of
@@ -47,12 +47,6 @@ NEIGHBOURS = 40
 """So many of the nearest connected photos are asked."""
 KEYPOINTS = 8
 """A photo with fewer shows next to nothing: a lens cap without noise, a white sky."""
-TONE_PX, BLACK, WHITE = 64, 12, 243
-"""Longest side in px of a picture that is asked whether it is black or white all over, and the
-levels of 255 below and above which it is.
-"""
-ONE_TONE = "it is black or white all over"
-"""The reason recorded for such a photo."""
 UNTIED = "no point that photos share has a place of its own, so each is placed by its metadata"
 """Why a panorama is not adjusted."""
 LOOSE = "photos share too little to be adjusted together, so each is placed by its metadata"
@@ -69,7 +63,7 @@ class ByLinks:
 
     bundle: Bundle = field(default_factory=Bundle)
     """The adjustment."""
-    version: ClassVar[int] = 21
+    version: ClassVar[int] = 22
     needs_links: ClassVar[bool] = True
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -157,7 +151,7 @@ class Auto:
     """For linked photos."""
     pose: ByReport
     """For photos that only have positions."""
-    version: ClassVar[int] = 17
+    version: ClassVar[int] = 18
     needs_links: ClassVar[bool] = True
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -334,12 +328,17 @@ def with_loose_photos(alignment: Alignment, inputs: AlignmentInputs) -> Alignmen
             continue
         weak = rejected.pop(i, "it could not be linked to any other photo")
         R = cam_R_map_from_angles(yaw, priors[i].pitch_deg, priors[i].roll_deg)
-        if shown_already(Pose(cam_R_map=R, map_C=C), photo.lens, alignment):
+        pose = Pose(cam_R_map=R, map_C=C)
+        if shutter_closed(photo, i, pose, alignment, inputs.grey):
+            rejected[i] = CLOSED
+            notes.append(f"{photo.name} is left out: {CLOSED}.")
+            continue
+        if shown_already(pose, photo.lens, alignment):
             rejected[i] = (
                 f"{weak}, and what it would show by its metadata is shown by photos that are"
             )
             continue
-        poses[i] = Pose(cam_R_map=R, map_C=C)
+        poses[i] = pose
         cameras.setdefault(photo.camera_key, photo.lens)
         camera_of[i] = photo.camera_key
         blocks.append((i,))
@@ -381,17 +380,6 @@ def _flown(
         told = headings_by_course([inputs.photos[i] for i in asked], at[asked], yaw[asked])
         yaw[asked] = told
     return yaw.tolist()
-
-
-def one_tone(photo: Photo, grey: Callable[[int], NDArray[np.uint8]]) -> bool:
-    """Whether a photo without links is black or white all over: a lens cap, a failed exposure. It
-    would be drawn as a hole in the map. Measured values are none. `grey`: the photo in grey, by its
-    longest side; in a small one the noise of the sensor, in which features are found, is gone.
-    """
-    if photo.dtype != "uint8" or photo.unit:
-        return False
-    dark, light = np.percentile(grey(TONE_PX), [1, 99])
-    return bool(light < BLACK or dark > WHITE)
 
 
 def shown_already(pose: Pose, camera: Camera, alignment: Alignment) -> bool:

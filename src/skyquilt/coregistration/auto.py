@@ -54,7 +54,7 @@ class Auto:
     """Agreement above which nothing else is tried."""
     beyond: bool = True
     """Whether everything is searched where a guess is not confirmed."""
-    version: ClassVar[int] = 7
+    version: ClassVar[int] = 8
 
     def __call__(self, a: Picture, b: Picture, guess: Guess | None = None) -> Outcome:
         """The registration of b to a, or the reason why there is none.
@@ -84,7 +84,7 @@ class Auto:
 
     def _guided(self, a: Picture, b: Picture, guess: Guess, *, told: bool = False) -> Outcome:
         """The decision in the neighbourhood of a guess, on the part that both images then share;
-        `told`: it is known beforehand.
+        `told`: it is known beforehand, which excludes places beyond its reach.
         """
         part = common_part(a, b, guess)
         pictures = both_usable(part.a, part.b)
@@ -92,7 +92,7 @@ class Auto:
             return pictures
         pyramid = Pyramid(a=pictures[0], b=pictures[1], sides=self.sides)
         fits = self._best(pyramid, self._near(pyramid, part.guess))
-        reach = part.guess.reach * max(pyramid.at(_DECIDE)[1].shape)
+        reach = part.guess.reach * max(pyramid.at(_DECIDE)[1].shape) if told else float("inf")
         return part.whole(self.decide(pyramid, fits, reach, told=told))
 
     def _stretched(self, pyramid: Pyramid, proposed: Proposal) -> Outcome:

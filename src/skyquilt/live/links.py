@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.aligners import KEYPOINTS, one_tone
+from skyquilt.alignment.aligners import KEYPOINTS
+from skyquilt.alignment.nothing_shown import one_tone
 from skyquilt.engine.codec import decode, encode
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.store import Store

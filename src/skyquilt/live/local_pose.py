@@ -7,9 +7,9 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.aligners import ONE_TONE
 from skyquilt.alignment.determined import AGAINST, elsewhere_reason, lies_elsewhere
 from skyquilt.alignment.local_adjustment import AdjustedWindow, LocalAdjustment, Window
+from skyquilt.alignment.nothing_shown import ONE_TONE
 from skyquilt.alignment.oblique import axes_apart_deg
 from skyquilt.errors import AlignmentError, UnreadablePhotoError
 from skyquilt.live.background_adjustment import QUICK

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skyquilt.alignment.motion import velocities_of
+from skyquilt.alignment.nothing_shown import CLOSED
 from skyquilt.coregistration.band_rig import FindBandRig
 from skyquilt.coregistration.beside import Beside
 from skyquilt.coregistration.pictures import guess_of, of_photo
@@ -39,7 +40,7 @@ from skyquilt.photos.left_out import told_left_out, without_partner
 from skyquilt.photos.together import late_by, taken_together
 from skyquilt.raster import CogWriter, RasterSpec
 from skyquilt.settings import PictureSettings
-from skyquilt.thermal.closed_shutter import CLOSED, closed_frames
+from skyquilt.thermal.closed_shutter import closed_frames
 from skyquilt.thermal.rig_marks import drawn, marks_in
 from skyquilt.workflows.flow import Scene
 from skyquilt.workflows.photo_features import THUMBNAIL, pixels_again

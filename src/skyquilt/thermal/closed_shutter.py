@@ -17,11 +17,6 @@ MOST = 0.6
 """Share of the frames that show the same ground, beside which it must be so."""
 LEAST = 25
 """Fewest points that two frames must share."""
-CLOSED = (
-    "it shows next to nothing where other frames show the ground, as a camera does while its"
-    " shutter is closed to calibrate it"
-)
-"""Why such frames are not drawn."""
 
 
 def closed_frames(samples: Samples) -> set[int]:
