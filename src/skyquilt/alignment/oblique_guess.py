@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.determined import STATED_DEG
 from skyquilt.alignment.oblique import OBLIQUE_DEG, tilt_deg, tilted, tilts_reported, turned_deg
-from skyquilt.alignment.oblique_start import as_found, off_positions, slanting, turned_far
+from skyquilt.alignment.oblique_start import (
+    as_found,
+    levelled_about_line,
+    off_positions,
+    slanting,
+    told_directions,
+    turned_far,
+)
 from skyquilt.alignment.priors import empty_prior
 from skyquilt.geometry.frames import angles_from_cam_R_map, cam_R_map_from_angles
 from skyquilt.matching.lens_kind import as_pinhole
@@ -185,10 +192,27 @@ def _tilted_alike(
         around = [(best[0] + step * i, best[1] + step * j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
         least, best = min((missed(tilt), tilt) for tilt in around)
     guess = [_looking(p, yaws.get(i, np.nan), *best) for i, p in enumerate(priors)]
+    guess = _levelled(guess, priors, found)
     turned = as_found(found, priors)
     if (whole := _miss(rays, _rotations(turned))) < least:
         guess, least = turned, whole
     return (guess, least) if least < ABOUT_AS_WELL * _miss(rays, own) else (None, np.inf)
+
+
+def _levelled(guess: list[Prior], priors: Sequence[Prior], found: Alignment) -> list[Prior]:
+    """A guess with level horizons where positions lie in a line: rays miss by as much however all
+    photos are turned about it, so what was guessed of that is chance.
+    """
+    held = [i for i in found.held if np.isfinite(priors[i].map_C).all()]
+    if told_directions([priors[i] for i in held]) != 1:
+        return guess
+    turn = levelled_about_line(
+        np.array([found.poses[i].map_C for i in held]), _rotations([guess[i] for i in held])
+    )
+    for i in held:
+        R = cam_R_map_from_angles(guess[i].yaw_deg, guess[i].pitch_deg, guess[i].roll_deg)
+        guess[i] = _looking(guess[i], *angles_from_cam_R_map(R @ turn.T))
+    return guess
 
 
 def lowered(found: Alignment, priors: Sequence[Prior]) -> Sequence[Prior]:

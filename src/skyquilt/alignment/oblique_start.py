@@ -24,7 +24,11 @@ from skyquilt.alignment.oblique import (
 from skyquilt.alignment.similarity_graph import components
 from skyquilt.alignment.start import GROSS_DEG, Start, heading_errors, plane_link
 from skyquilt.alignment.triangulate import intersect
-from skyquilt.geometry.frames import angles_from_cam_R_map, cam_R_map_from_angles
+from skyquilt.geometry.frames import (
+    angles_from_cam_R_map,
+    cam_R_map_from_angles,
+    rotation_from_vector,
+)
 from skyquilt.matching.lens_kind import as_pinhole
 from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import Photo
@@ -53,6 +57,10 @@ CROWDED = 5.0
 WIDE = 2.0
 """Least spread of positions across their main direction, in their deviations (RMS), that tells how
 all are turned about it.
+"""
+ACROSS = 0.5
+"""Least rise of photos' rows, to their length, as they are turned about a line by a right angle, by
+which their horizon tells how they are turned about it.
 """
 FEWEST_MET = 50
 """Fewest such pairs of rays that tell the height of the ground."""
@@ -194,18 +202,44 @@ def as_found(found: Alignment, priors: Sequence[Prior]) -> list[Prior]:
 
 def turned_aside(found: Alignment, priors: Sequence[Prior]) -> Array:
     """(3, 3) rotation of an adjustment as a whole by which photos come nearest to the positions
-    that they report; none where these lie about in a line.
+    that they report; where these lie about in a line, which does not tell how all are turned about
+    it, the one by which horizons are level.
     """
     held = [i for i in found.held if np.isfinite(priors[i].map_C).all()]
-    if len(held) < FEWEST_CROWDED:
-        return np.eye(3)
     C = np.array([found.poses[i].map_C for i in held])
-    there = np.array([priors[i].map_C for i in held])
-    C, there = C - C.mean(0), there - there.mean(0)
-    wide = np.linalg.svd(there, compute_uv=False)[1] / np.sqrt(len(held))
-    if not wide > WIDE * float(np.median([priors[i].sigma_C[0] for i in held])):
+    directions = told_directions([priors[i] for i in held])
+    if directions == 1:
+        return levelled_about_line(C, np.array([found.poses[i].cam_R_map for i in held]))
+    if directions == 0:
         return np.eye(3)
-    return fit_similarity_3d(C, there)[1]
+    there = np.array([priors[i].map_C for i in held])
+    return fit_similarity_3d(C - C.mean(0), there - there.mean(0))[1]
+
+
+def told_directions(priors: Sequence[Prior]) -> int:
+    """In how many directions positions spread clearly further than they err: 2 over an area, 1
+    along a line, 0 about one place, or of too few.
+    """
+    if len(priors) < FEWEST_CROWDED:
+        return 0
+    there = np.array([p.map_C for p in priors])
+    spread = np.linalg.svd(there - there.mean(0), compute_uv=False)[:2] / np.sqrt(len(priors))
+    return int((spread > WIDE * float(np.median([p.sigma_C[0] for p in priors]))).sum())
+
+
+def levelled_about_line(C: Array, cam_R_map: Array) -> Array:
+    """(3, 3) rotation about the line of centres (n, 3) by which the horizons of photos with these
+    rotations (n, 3, 3) are level, as gimbals hold them; none where their rows lie along it, so that
+    it would not tilt these.
+    """
+    axis = np.linalg.svd(C - C.mean(0), full_matrices=False)[2][0]
+    right = cam_R_map[:, 0]
+    rises = np.array([right[:, 2], np.cross(axis, right)[:, 2]])
+    if not (rises[1] ** 2).mean() > ACROSS**2:
+        return np.eye(3)
+    cosine, sine = np.linalg.eigh(rises @ rises.T)[1][:, 0].tolist()
+    angle = float(np.arctan2(sine * np.sign(cosine), abs(cosine)))
+    return np.asarray(rotation_from_vector(angle * axis), np.float64)
 
 
 def off_positions(found: Alignment, priors: Sequence[Prior]) -> float:
