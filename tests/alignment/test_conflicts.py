@@ -2,10 +2,13 @@
 is.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from skyquilt.alignment.conflicts import conflicts
+from skyquilt.alignment.false_heights import outvoted_heights
 from tests.alignment.surveys import alignment, photo, prior
 
 
@@ -53,6 +56,29 @@ def test_headings_that_are_all_half_a_turn_off(off, signs):
     assert len(found) == 8 and all(
         ("both have the wrong sign" in c.meaning) == signs for c in found
     )
+
+
+def test_where_half_of_the_heights_are_not_used_the_other_half_is_not_accused():
+    """The map lies by those of one of two take-off points."""
+    photos, _ = survey()
+    told = [prior((0, 15 * i, 60 if i % 2 else 46), yaw=10.0) for i in range(8)]
+    unused = outvoted_heights(
+        replace(alignment(), poses={i: raised(p, -7.0) for i, p in alignment().poses.items()}),
+        [p.name for p in photos],
+        told,
+        ["b" if i % 2 else "a" for i in range(8)],
+    )
+    assert unused is not None
+    kept = {i for i, p in enumerate(unused.priors) if np.isfinite(p.map_C[2])}
+    base = 60.0 if 1 in kept else 46.0
+    poses = {i: raised(p, base - 60) for i, p in alignment().poses.items()}
+    found = conflicts(photos, told, replace(alignment(), poses=poses, notes=(unused.note,)))
+    assert {c.photo for c in found} == {f"{i}.jpg" for i in range(8)} - {f"{i}.jpg" for i in kept}
+    assert {c.estimated for c in found} == {base}
+
+
+def raised(pose, by_m):
+    return replace(pose, map_C=pose.map_C + (0, 0, by_m))
 
 
 @pytest.mark.parametrize(

@@ -12,15 +12,15 @@ SIGMA_M = 3.0
 
 
 def told_at(heights, sigma=SIGMA_M, lifted_m=0.0):
-    """An alignment of photos 60 m high, lifted by what false heights do, the photos' names, and
-    priors with these heights.
+    """An alignment of photos 60 m high, lifted by what false heights do, the photos' names,
+    priors with these heights, and cameras.
     """
     true = lines(len(heights))
     told = np.column_stack([true[:, :2], heights])
-    found, names, priors, _ = survey(true + (0, 0, lifted_m), told, SIGMA_M)
+    found, names, priors, cameras = survey(true + (0, 0, lifted_m), told, SIGMA_M)
     stated = np.broadcast_to(sigma, len(true))
     priors = [replace(p, sigma_C=np.full(3, s)) for p, s in zip(priors, stated, strict=True)]
-    return found, names, priors
+    return found, names, priors, cameras
 
 
 def noisy(count, sigma=SIGMA_M, seed=0):
@@ -34,8 +34,8 @@ def test_heights_that_most_others_contradict_are_not_used(false, by_m, seed):
     heights = noisy(20, seed=seed)
     wrong = np.random.default_rng(seed).permutation(20)[:false]
     heights[wrong] += by_m
-    found, names, priors = told_at(heights, lifted_m=by_m * false / 20 + 5)
-    told = outvoted_heights(found, names, priors)
+    found, names, priors, cameras = told_at(heights, lifted_m=by_m * false / 20 + 5)
+    told = outvoted_heights(found, names, priors, cameras)
     assert {i for i, p in enumerate(told.priors) if np.isnan(p.map_C[2])} == set(wrong)
     assert all(
         np.array_equal(a.map_C[:2], b.map_C[:2]) for a, b in zip(told.priors, priors, strict=True)
@@ -78,13 +78,31 @@ def test_heights_above_several_take_off_points_count_from_that_of_most_photos(
     heights[second:] += by_m
     heights[third:] += by_m
     parts = [range(second), range(second, third), range(third, 20)]
-    found, names, priors = told_at(heights, lifted_m=float(heights.mean()) - 60)
+    found, names, priors, cameras = told_at(heights, lifted_m=float(heights.mean()) - 60)
     found = replace(found, frame=replace(found.frame, vertical_datum="takeoff"))
-    told = outvoted_heights(found, names, priors)
+    told = outvoted_heights(found, names, priors, cameras)
     kept = [i for i, p in enumerate(told.priors) if np.isfinite(p.map_C[2])]
     assert kept == list(max(parts, key=len))
     assert "take-off point" in told.note
     assert height_warnings(priors, replace(found, notes=(told.note,))) == []
+
+
+@pytest.mark.parametrize("of_second", [6, 10, 13])
+@pytest.mark.parametrize("by_m", [-14.0, 12.0])
+def test_drones_that_fly_at_once_have_take_off_points_of_their_own(of_second, by_m):
+    heights = noisy(20, 0.7)
+    second = np.isin(np.arange(20), np.random.default_rng(1).permutation(20)[:of_second])
+    heights[second] += by_m
+    found, names, priors, _ = told_at(heights, lifted_m=float(heights.mean()) - 60)
+    found = replace(found, frame=replace(found.frame, vertical_datum="takeoff"))
+    drones = ["b" if b else "a" for b in second]
+    told = outvoted_heights(found, names, priors, drones)
+    kept = np.array([np.isfinite(p.map_C[2]) for p in told.priors])
+    most = second if of_second > 10 or (of_second == 10 and second[0]) else ~second
+    assert np.array_equal(kept, most)
+    assert "take-off point" in told.note
+    mixed = ["b" if k % 3 else "a" for k in range(20)]  # the step comes and goes
+    assert outvoted_heights(found, names, priors, mixed) is None
 
 
 @pytest.mark.parametrize("kind", ["drift", "back", "small", "scattered"])
@@ -99,15 +117,15 @@ def test_heights_above_one_take_off_point_are_used(kind):
         heights[10:] += 6
     if kind == "scattered":
         heights[10:] += 12
-    found, names, priors = told_at(heights, lifted_m=float(heights.mean()) - 60)
+    found, names, priors, cameras = told_at(heights, lifted_m=float(heights.mean()) - 60)
     found = replace(found, frame=replace(found.frame, vertical_datum="takeoff"))
-    assert outvoted_heights(found, names, priors) is None
+    assert outvoted_heights(found, names, priors, cameras) is None
 
 
 @pytest.mark.parametrize("by_m", [-440.0, 60.0])
 def test_half_of_the_heights_against_the_other_half_are_told(by_m):
     heights = noisy(20) + np.where(np.arange(20) % 2, by_m, 0)
-    found, names, priors = told_at(heights, lifted_m=by_m / 2)
-    assert outvoted_heights(found, names, priors) is None
+    found, names, priors, cameras = told_at(heights, lifted_m=by_m / 2)
+    assert outvoted_heights(found, names, priors, cameras) is None
     (note,) = height_warnings(priors, found)
     assert note.startswith("The reported heights contradict the pictures")

@@ -6,6 +6,7 @@ import numpy as np
 
 from skyquilt.alignment.crowded_positions import believed
 from skyquilt.alignment.displaced_parts import as_taken
+from skyquilt.alignment.false_heights import outvoted
 from skyquilt.alignment.late_positions import as_moved
 from skyquilt.alignment.motion import Speeds
 from skyquilt.alignment.oblique_guess import lowered
@@ -103,13 +104,15 @@ def _altitudes(
     """Altitudes that differ from the solution by more than three deviations and 5 % of the flying
     height.
 
-    An offset common to all photos comes from the height datum and is not a contradiction.
+    An offset common to all photos comes from the height datum and is not a contradiction. Where
+    some heights were not used, the others have none: the map lies by them.
     """
     z = np.array([alignment.poses[i].map_C[2] for i in held])
     off = np.array([priors[i].map_C[2] for i in held]) - z
     if not np.isfinite(off).any():
         return []
-    off = off - np.nanmedian(off)
+    if not outvoted(alignment):
+        off = off - np.nanmedian(off)
     out = []
     for i, e, height in zip(held, off, z - alignment.ground_m, strict=True):
         if np.isfinite(e) and abs(e) > max(2 * priors[i].sigma_C[2], 0.05 * height):

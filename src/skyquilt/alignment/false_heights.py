@@ -67,17 +67,20 @@ def _majority(off: Numbers, stated: Numbers) -> NDArray[np.bool_] | None:
     return np.asarray(agree)
 
 
-def _flights(off: Numbers) -> NDArray[np.bool_] | None:
-    """Which differences are those of the flight with most photos, of equally many the first one,
-    where flights one after the other have heights above take-off points of their own. None where
-    they have not.
+def _flights(off: Numbers, cameras: Sequence[str]) -> NDArray[np.bool_] | None:
+    """Which differences are those of the flights from the take-off point with most photos, of
+    equally many the first one, where flights of a camera one after the other, or of several drones
+    at once, have heights above take-off points of their own. None where they have not.
     """
     order = np.argsort(off)
     gap = np.diff(off[order])
     wide = gap > STEP_M
     group = np.empty(len(off), np.int64)
     group[order] = np.cumsum(np.r_[False, wide])
-    if not wide.any() or np.count_nonzero(np.diff(group)) != wide.sum():
+    drone = np.unique(cameras, return_inverse=True)[1]
+    runs = np.column_stack([drone, group])[np.argsort(drone, kind="stable")]
+    began = 1 + np.count_nonzero(np.diff(runs, axis=0).any(1))
+    if not wide.any() or began != len(np.unique(runs, axis=0)):  # it comes and goes
         return None
     middle = np.array([np.median(off[group == k]) for k in range(wide.sum() + 1)])
     if gap[wide].min() < AGREE * float(np.median(np.abs(off - middle[group]))):
@@ -87,16 +90,17 @@ def _flights(off: Numbers) -> NDArray[np.bool_] | None:
 
 
 def outvoted_heights(
-    found: Alignment, names: Sequence[str], priors: Sequence[Prior]
+    found: Alignment, names: Sequence[str], priors: Sequence[Prior], cameras: Sequence[str]
 ) -> FalseHeights | None:
     """The priors without the heights of photos that contradict those of most others; of flights
-    from several take-off points without those of all but one. Photos are in order of capture. None
-    where no majority agrees, or where the map lies by it already.
+    from several take-off points without those of all but one. Photos are in order of capture, by
+    the cameras of these names. None where no majority agrees, or where the map lies by it already.
     """
     own, off, stated = _differences(found, priors)
     if len(own) < FEWEST:
         return None
-    flights = _flights(off) if found.frame.vertical_datum == "takeoff" else None
+    takeoff = found.frame.vertical_datum == "takeoff"
+    flights = _flights(off, [cameras[i] for i in own]) if takeoff else None
     agree = _majority(off, stated) if flights is None else flights
     if agree is None or agree.all():
         return None

@@ -279,7 +279,7 @@ def _outvoted_positions(last: Tried, survey: Survey) -> Tried:
 
 def _outvoted_heights(last: Tried, survey: Survey) -> Tried:
     """Heights that contradict those of most photos are not used."""
-    majority = outvoted_heights(last.found, survey.names, last.begun.priors)
+    majority = outvoted_heights(last.found, survey.names, last.begun.priors, survey.cameras)
     if majority is None:
         return last
     other = survey.tried(last.begun, priors=majority.priors, name="heights ")
