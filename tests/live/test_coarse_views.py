@@ -53,6 +53,24 @@ def orbit(photos, radius, height):
     return views
 
 
+@pytest.mark.parametrize("radius", [75.0, 60.0])
+def test_neighbouring_tiles_of_an_orbit_show_a_roof_between_them_at_one_place(radius):
+    """Drawn from other photos on the two sides, what stands there breaks at the rim of a tile."""
+    views, y = orbit(40, radius, 75.0), np.linspace(-24.0, 26.0, 60)[:, None]
+    apart = []
+    for rim in (-51.2, -25.0, 0.0, 10.0):
+        leans = []
+        for west in (rim - 51.2, rim):
+            grid = Grid(gsd=0.2, west=west, north=26.4, width=256, height=256)
+            tile = showing_best(views, grid, level(0.0), MOST_VIEWS)
+            nodes = [project_nodes(v, np.full_like(y, rim), y, np.zeros_like(y)) for v in tile]
+            score = np.array([np.where(n.seen, n.score, np.inf)[:, 0] for n in nodes])
+            C = np.array([v.pose.map_C for v in tile])[score.argmin(0)]
+            leans.append((np.column_stack([np.full(60, rim), y[:, 0]]) - C[:, :2]) / C[:, 2:])
+        apart.append(5.0 * np.hypot(*(leans[0] - leans[1]).T))  # m, of a roof 5 m high
+    assert (np.concatenate(apart) > 0.5).mean() < 0.02
+
+
 @pytest.mark.parametrize(("radius", "north"), [(75.0, 110.0), (75.0, 20.0), (5.0, 40.0)])
 def test_a_tile_is_drawn_from_the_photos_that_show_its_places_best(radius, north):
     """The nearest ones of an orbit look away from the ground below them: it stayed empty."""

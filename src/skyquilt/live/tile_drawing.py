@@ -77,7 +77,7 @@ a palette; `thermal` has degrees Celsius.
 """
 RIM = 12
 """Cells around a tile whose heights are looked at, too, so that neighbouring tiles agree."""
-MOST_VIEWS = 24
+MOST_VIEWS = 40
 """Largest number of photos from which a tile is composed."""
 LEAST_MOVE = 0.6
 """A photo is drawn again if it has moved by more than this number of map pixels."""
