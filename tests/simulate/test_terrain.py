@@ -6,10 +6,12 @@ from typing import get_args
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from typer.testing import CliRunner
 
 from skyquilt.cli.main import app
 from skyquilt.cli.simulate import TerrainName
+from skyquilt.simulate.canvas import Canvas
 from skyquilt.simulate.expose import exposer
 from skyquilt.simulate.flight import Shot, Waypoint
 from skyquilt.simulate.grid import Grid
@@ -132,3 +134,42 @@ def test_few_places_have_the_noise_of_many():
         few = noise.fractal(land.window(row, col, height, width), 40.0, 3.0, 0.6, 9)
         assert few.dtype == np.float32
         assert few == pytest.approx(whole[row : row + height, col : col + width], abs=1e-6)
+
+
+def painted(kind: Terrain, x: float, y: float) -> Canvas:
+    """12 x 12 m about a place, as large as the painter's blocks have them, without sunlight."""
+    grid = country(kind).grid(0.1).around(x, y, 6.0)
+    return country(kind).paint(grid, Weather())
+
+
+def test_panels_are_alike_and_the_ground_between_is_not():
+    """Rows 8 m apart: brightness and height above the ground repeat, grass does not."""
+    parcels = [p for p in country("solar").layout.parcels if np.hypot(*p.outline.mean(axis=0)) < 70]
+    x, y = max((p.outline for p in parcels), key=lambda o: np.ptp(o, axis=0).min()).mean(axis=0)
+    low, high = (painted("solar", x, y + up) for up in (0.0, 8.0))
+    above = low.height - low.ground
+    panel = above > 0.5
+    assert 0.3 < panel.mean() < 0.5
+    assert above[panel].max() == pytest.approx(0.8 + 0.45 * 3.6, abs=0.1)
+    np.testing.assert_allclose(above[panel], (high.height - high.ground)[panel], atol=1e-3)
+    same = np.corrcoef(low.look[panel][:, 1], high.look[panel][:, 1])[0, 1]
+    other = np.corrcoef(low.look[~panel][:, 1], high.look[~panel][:, 1])[0, 1]
+    assert same > 0.98
+    assert abs(other) < 0.3
+
+
+def test_orchards_have_trees_in_rows_and_dunes_nothing_but_ripples():
+    trees = [t for t in country("orchard").layout.trees if t.height < 4.6]
+    places = np.array([(t.x, t.y) for t in trees])
+    nearest = cKDTree(places).query(places, k=2)[0][:, 1]
+    assert np.median(nearest) == pytest.approx(6.0, abs=0.6)
+    assert np.ptp([t.radius for t in trees if t.radius > 1.5]) < 1.2
+    dunes = country("dunes")
+    assert not dunes.layout.trees
+    assert not dunes.layout.roads
+    look = painted("dunes", 5.0, 5.0).look[..., 1]
+    assert look.std() / look.mean() < 0.05
+
+
+def test_crops_are_rows_everywhere():
+    assert {p.kind for p in country("crops").layout.parcels} == {"crop", "maize"}

@@ -18,7 +18,19 @@ if TYPE_CHECKING:
 
 PresetName = Literal["default", "demo", "strip", "roundtrip", "thermal", "drones"]
 TerrainName = Literal[
-    "landscape", "bare", "slope", "cliff", "quarry", "bridge", "town", "shore", "chessboard"
+    "landscape",
+    "bare",
+    "slope",
+    "cliff",
+    "quarry",
+    "bridge",
+    "town",
+    "shore",
+    "orchard",
+    "crops",
+    "solar",
+    "dunes",
+    "chessboard",
 ]
 """Equal to `simulate.terrain.Terrain`, which is not imported before it is needed."""
 

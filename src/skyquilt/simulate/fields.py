@@ -49,6 +49,10 @@ COVERS = {
     "maize": Cover(
         material=m.MAIZE, grain=0.10, fine=0.10, patchy=0.06, spacing=0.8, rows=0.26, height=1.6
     ),
+    "panels": Cover(material=m.MEADOW, grain=0.05, fine=0.08, patchy=0.08),
+    "sand": Cover(
+        material=m.SAND, grain=0.012, fine=0.010, patchy=0.012, spacing=0.9, rows=0.012, height=0.06
+    ),
     "pond": Cover(material=m.MEADOW, grain=0.05, fine=0.11, patchy=0.12),
     "stubble": Cover(
         material=m.STUBBLE, grain=0.06, fine=0.07, patchy=0.06, spacing=1.6, rows=0.10, height=0.12
@@ -104,7 +108,7 @@ def _rows(
     wave = np.cos(across * _per_cell([2 * np.pi / c.spacing for c in covers], index))
     tall = _per_cell([c.height for c in covers], index)
     offset = np.abs(np.mod(across, 18.0) - np.float32(9.0))
-    track = ((np.abs(offset - np.float32(0.9)) < 0.22) & (tall > 0)).astype(np.float32)
+    track = ((np.abs(offset - np.float32(0.9)) < 0.22) & (tall > 0.1)).astype(np.float32)
     gaps = np.clip(canvas.patchy - np.float32(1.9), 0, 1) * (contrast > 0.15)
     height = tall * (1 - track) * (0.75 + 0.25 * wave) + 0.12 * tall * canvas.fine
     return contrast * wave * (1 - track) + track * np.float32(0.16) + gaps * np.float32(
@@ -115,7 +119,7 @@ def _rows(
 def paint_borders(canvas: Canvas, layout: Layout) -> None:
     """Paints irregular strips of grass between parcels."""
     for parcel in layout.parcels:
-        if parcel.kind != "yard" and canvas.touches(parcel.outline, 2.0):
+        if parcel.kind not in ("yard", "sand") and canvas.touches(parcel.outline, 2.0):
             strip = cv2.GaussianBlur(
                 canvas.line(parcel.outline, 1.5), (0, 0), 0.25 / canvas.grid.res
             )

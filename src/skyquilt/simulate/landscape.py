@@ -27,7 +27,14 @@ uses.
 """
 
 
-_USES = {"bare": ("bare", "stubble"), "town": ("yard", "yard", "yard", "meadow", "yard", "orchard")}
+_USES = {
+    "bare": ("bare", "stubble"),
+    "town": ("yard", "yard", "yard", "meadow", "yard", "orchard"),
+    "orchard": ("orchard",),
+    "crops": ("crop", "maize"),
+    "solar": ("panels",),
+    "dunes": ("sand",),
+}
 """Land uses of kinds of terrain that have others than `KINDS`."""
 
 
@@ -45,7 +52,7 @@ def landscape(
     houses, trees, cars = _furnish(lots, kinds, frame, rng)
     if terrain == "town":
         houses = [_block(house, rng) for house in houses]
-    roads = _roads(cuts, frame)
+    roads = () if terrain in ("dunes", "solar") else _roads(cuts, frame)
     trees += _avenue(roads, rng)
     ponds = tuple(
         _shore(lot, frame, rng) for lot, kind in zip(lots, kinds, strict=True) if kind == "pond"

@@ -24,6 +24,7 @@ from skyquilt.simulate.landscape import landscape
 from skyquilt.simulate.layout import Layout
 from skyquilt.simulate.light import lit, shadow_reach, shine
 from skyquilt.simulate.noise import Noise
+from skyquilt.simulate.panels import paint_panels
 from skyquilt.simulate.targets import Target, paint_targets
 from skyquilt.simulate.terrain import Terrain
 from skyquilt.simulate.things import paint_things
@@ -144,6 +145,7 @@ class Country:
             paint_roads(canvas, self.layout)
             paint_ponds(canvas, self.layout)
             paint_shape(canvas, self.settings.kind)
+            paint_panels(canvas, self.layout)
             paint_things(canvas, self.layout, self.ground)
         paint_targets(canvas, self.targets)
         return canvas

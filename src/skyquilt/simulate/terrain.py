@@ -8,13 +8,27 @@ from numpy.typing import NDArray
 from skyquilt.simulate.grid import Floats, Grid
 
 Terrain = Literal[
-    "landscape", "bare", "slope", "cliff", "quarry", "bridge", "town", "shore", "chessboard"
+    "landscape",
+    "bare",
+    "slope",
+    "cliff",
+    "quarry",
+    "bridge",
+    "town",
+    "shore",
+    "orchard",
+    "crops",
+    "solar",
+    "dunes",
+    "chessboard",
 ]
 """Kinds of terrain. `landscape`: farmland over hills. The others have the same hills, and besides:
 `bare`: only fields without crops; `slope`: a mountain side of 30 degrees that falls to the north by
 80 m; `cliff`: a wall of 45 m that faces east; `quarry`: a pit with four benches of 9 m; `bridge`: a
 ravine 22 m deep and a road across it at its rim's height; `town`: blocks of houses of 10 to 32 m;
-`shore`: a lake in the west, whose waves move from photo to photo. `chessboard`: a level board.
+`shore`: a lake in the west, whose waves move from photo to photo; `orchard`: alike trees in rows
+everywhere; `crops`: rows of plants everywhere; `solar`: rows of panels that are all alike; `dunes`:
+sand or snow with faint ripples. `chessboard`: a level board.
 """
 WATER_M = -2.0
 """Level of the lake of `shore`, m above the base."""
@@ -66,7 +80,7 @@ def deck(grid: Grid) -> NDArray[np.bool_]:
 
 def stands_anywhere(kind: Terrain) -> bool:
     """Whether houses, trees and targets can stand everywhere, whatever the heights."""
-    return kind in ("landscape", "bare", "town")
+    return kind not in ("slope", "cliff", "quarry", "bridge", "shore")
 
 
 def stands(kind: Terrain, heights: Floats, grid: Grid) -> bool:
