@@ -193,6 +193,10 @@ def command(
     fires: Annotated[
         int | None, typer.Option(help="fires on the site, whose smoke drifts over it")
     ] = None,
+    clouds: Annotated[
+        float | None,
+        typer.Option(help="ground in shadows of clouds that drift with the wind, percent"),
+    ] = None,
     lose: Annotated[int | None, typer.Option(help="photos lost on the way")] = None,
     oblique: Annotated[
         int | None,
@@ -255,6 +259,7 @@ def command(
         sun_hours=sun_hours,
         motion_blur=motion_blur,
         fires=fires,
+        clouds=_share(clouds),
     )
     base = _with(base, "control", points=gcp, checks=checks)
     base = _thermal(

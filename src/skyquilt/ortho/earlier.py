@@ -190,7 +190,12 @@ def with_new(old: Exposure, fresh: Exposure) -> Exposure:
         offsets |= {i: o + level for i, o in fresh.offsets.items() if i not in offsets}
     patterns = {i: p for i, p in fresh.patterns.items() if i not in old.offsets}
     return replace(
-        old, gains=gains, fields=fields, offsets=offsets, patterns={**old.patterns, **patterns}
+        old,
+        gains=gains,
+        fields=fields,
+        offsets=offsets,
+        patterns={**old.patterns, **patterns},
+        shades={i: s for i, s in fresh.shades.items() if i not in old.gains} | dict(old.shades),
     )
 
 
@@ -206,6 +211,7 @@ def complete(exposure: Exposure, views: Sequence[View]) -> Exposure:
         gains={i: exposure.gains.get(i, none[0]) for i in photos},
         fields={i: exposure.fields.get(i, none[1]) for i in photos},
         offsets={i: o for i, o in exposure.offsets.items() if i in set(photos)},
+        shades={i: s for i, s in exposure.shades.items() if i in set(photos)},
     )
 
 

@@ -1,11 +1,12 @@
 """Exposure: brings overlapping photos to a common brightness, from the ground that they share.
 
 Per camera a radial fall of light (vignetting, in even powers of the radius, as Goldman 2010 and
-others), per photo a gain for each band and a smooth field over the image (a cloud's shadow, the
-sun's hot spot). Gains act on the odds x / (1 - x) of a pixel value x in (0, 1), not on the value:
-black stays black and white stays white, so nothing clips or turns purple, and two gains in a row
-are one gain. Where a survey's overlaps show that its values follow the light in proportion (as
-those of linear sensors), they act on x / (3 - x), which nearly is a factor on x.
+others), per photo a gain for each band and a smooth field over the image (the sun's hot spot), and
+where clouds move their shadows (`cloud_shadows`). Gains act on the odds x / (1 - x) of a pixel
+value x in (0, 1), not on the value: black stays black and white stays white, so nothing clips or
+turns purple, and two gains in a row are one gain. Where a survey's overlaps show that its values
+follow the light in proportion (as those of linear sensors), they act on x / (3 - x), which nearly
+is a factor on x.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.imaging.nodes import View, even_places, project_nodes
 from skyquilt.model.surface import Surface
+from skyquilt.ortho import cloud_shadows
 from skyquilt.ortho.differences import (
     CORRELATED,
     SETTLED,
@@ -59,6 +61,8 @@ class Exposure:
     """Photo -> offset added to measured values, in their unit."""
     patterns: Mapping[int, Float] = field(default_factory=dict)
     """Photo -> (h, w) correction of measured values at nodes of the frame (`frame_pattern`)."""
+    shades: Mapping[int, Float] = field(default_factory=dict)
+    """Photo -> (n, n) in log odds at nodes of the picture (`cloud_shadows`), beside its field."""
     white: float = WHITES[0]
     """Value at which the response ends: gains act on the odds x / (white - x)."""
     level: float = 1.0
@@ -66,11 +70,21 @@ class Exposure:
 
     def uneven(self, photo: int) -> bool:
         """Whether the photo needs more than one gain per band."""
-        return bool(np.abs(self.fields[photo]).max() > 0)
+        return photo in self.shades or bool(np.abs(self.fields[photo]).max() > 0)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the report tells of it."""
+        if not self.shades:
+            return ()
+        return (
+            "Shadows of clouds moved over the ground during the flight. They are evened out where"
+            " photos differ; what all photos of a place, or its only one, show in shadow stays so.",
+        )
 
     def odds(self, photo: int, x: Float, y: Float) -> Float:
         """Factors (h, w, bands) on the odds at image positions x, y (h, w), see `image_place`."""
-        field = np.exp(_field(x, y, self.fields[photo]))
+        field = np.exp(self._light(photo, x, y))
         return np.asarray(field[..., None] * np.exp(self.gains[photo]), np.float32)
 
     def grey(self, view: View, value: NDArray[Any], u: NDArray[Any], v: NDArray[Any]) -> Float:
@@ -80,10 +94,17 @@ class Exposure:
         photo = view.photo
         if photo not in self.gains or self.level > 1:
             return np.asarray(value, np.float32)
-        field = _field(*image_place(view, u, v), self.fields[photo])
+        field = self._light(photo, *image_place(view, u, v))
         return np.asarray(
             self.brightened(value, np.exp(field + self.gains[photo].mean())), np.float32
         )
+
+    def _light(self, photo: int, x: NDArray[Any], y: NDArray[Any]) -> NDArray[Any]:
+        """(h, w) what is added to log odds at image positions x, y (h, w), but for the gains."""
+        even = _field(x, y, self.fields[photo])
+        if photo not in self.shades:
+            return even
+        return np.asarray(even + cloud_shadows.over(self.shades[photo], x, y))
 
     def brightened(self, value: NDArray[Any], odds: NDArray[Any]) -> NDArray[Any]:
         """Values with their odds multiplied."""
@@ -166,7 +187,7 @@ class Balance:
     """Least share of the differences between photos that fields must explain to be applied."""
     whites: tuple[float, ...] = WHITES
     """Values at which the cameras' response may end; the survey's overlaps decide."""
-    version: ClassVar[int] = 9
+    version: ClassVar[int] = 10
 
     def under(self, white: float) -> "Balance":
         """The same for a response that is known."""
@@ -187,15 +208,31 @@ class Balance:
         samples = self.samples(usable, thumbnails, surface, bounds, keep)
         if not len(samples.point):
             return NEUTRAL
-        where = np.array([v.footprint.mean(0) for v in usable])
+        best = self._found(samples, usable, keep)
+        if not _clouded(samples, best, usable, cloud_shadows.EXPLAINED):
+            return best
+        each = min(cloud_shadows.DENSE, cloud_shadows.MOST // len(usable))
+        wanted = int(samples.sought * each * len(usable) / len(samples.point))
+        dense = replace(self, points=max(wanted, int(samples.sought)))
+        samples = dense.samples(usable, thumbnails, surface, bounds, keep)
+        if not _clouded(samples, best, usable, cloud_shadows.SURELY):
+            return best
+        samples = samples.under(best.white)
+        level = samples.level(best, usable)
+        found = cloud_shadows.shades(samples.point, samples.row, samples.place, level, len(usable))
+        return replace(best, shades=dict(zip((v.photo for v in usable), found, strict=True)))
+
+    def _found(self, samples: "Samples", views: Sequence[View], keep: Keep) -> Exposure:
+        """Gains and fields, with the weights and the response that fit."""
+        where = np.array([v.footprint.mean(0) for v in views])
         pairs = Pairs.of(samples.row, samples.point, where)
-        wide, apart = self._best(samples, usable, pairs, keep, closely=False)
-        fields = np.stack([wide.fields[v.photo] for v in usable])
+        wide, apart = self._best(samples, views, pairs, keep, closely=False)
+        fields = np.stack([wide.fields[v.photo] for v in views])
         s = samples.under(wide.white)
-        tried = keep("tried", lambda: self._with_gains(s, usable, pairs, fields, closely=True))
-        if samples.apart(tried, usable) > (1 - BETTER / 2) * apart:  # saves the rest of the work
+        tried = keep("tried", lambda: self._with_gains(s, views, pairs, fields, closely=True))
+        if samples.apart(tried, views) > (1 - BETTER / 2) * apart:  # saves the rest of the work
             return wide
-        close, less = self._best(samples, usable, pairs, keep, closely=True, least=wide.white)
+        close, less = self._best(samples, views, pairs, keep, closely=True, least=wide.white)
         return close if less < (1 - BETTER) * apart else wide
 
     def _best(
@@ -367,6 +404,7 @@ class Balance:
             place=np.concatenate(place)[good],
             value=levels[good],
             prior=min(1.0, number / each),
+            sought=number,
         )
 
 
@@ -390,6 +428,8 @@ class Samples:
     """Weight of the priors: less where points lie further apart than usual, since their errors are
     less correlated then.
     """
+    sought: float = 0.0
+    """Ground points that were looked at, also those that no photo shows."""
 
     @cached_property
     def log(self) -> Float:
@@ -408,6 +448,12 @@ class Samples:
             out += basis * terms[:, k].astype(np.float32)[self.row]
         return out
 
+    def level(self, exposure: Exposure, views: Sequence[View]) -> Float:
+        """(N,) log odds of the grey values, corrected."""
+        gains = np.stack([exposure.gains[v.photo] for v in views]).mean(1)
+        fields = np.stack([exposure.fields[v.photo] for v in views])
+        return np.asarray(self.log.mean(1) + self.field(fields) + gains[self.row])
+
     def apart(self, exposure: Exposure, views: Sequence[View]) -> float:
         """Median difference from the mean of their point, in levels, of corrected samples: the mean
         of all bands, since white balance changes bands of a photo apart.
@@ -420,7 +466,18 @@ class Samples:
             exposure.brightened(value, np.exp(gains[self.row, k] + field))
             for k, value in enumerate(self.value.T)
         ]
-        return float(np.mean([_off_means(levels, self.point) for levels in bands]))
+        return float(np.mean([cloud_shadows.apart(self.point, levels) for levels in bands]))
+
+
+def _clouded(samples: Samples, found: Exposure, views: Sequence[View], least: float) -> bool:
+    """Whether what is left between photos looks like moving shadows of clouds: whether smooth
+    shades explain this share of it.
+    """
+    s = samples.under(found.white)
+    level = s.level(found, views)
+    if cloud_shadows.apart(s.point, level) < cloud_shadows.DIFFERENT:
+        return False
+    return cloud_shadows.explained(s.point, s.row, s.place, level, len(views)) > least
 
 
 def _around(view: View, x: NDArray[Any], y: NDArray[Any]) -> tuple[slice, slice]:
@@ -468,12 +525,4 @@ def _apart(y: NDArray[Any], pairs: Pairs, ridge: NDArray[Any], *, closely: bool)
     point, ones = pairs.point, np.ones((len(y), 1), np.float32)
     found = robust_differences(ones, pairs, y[:, None], ridge, closely=closely)
     level = y + found[:, 0, 0].astype(y.dtype)[pairs.row]
-    return _off_means(level, point)
-
-
-def _off_means(level: NDArray[Any], point: NDArray[np.integer[Any]]) -> float:
-    """Median difference of samples (N,) from the mean of their point."""
-    number = np.bincount(point)
-    mean = np.bincount(point, level) / np.maximum(number, 1)
-    several = number[point] > 1
-    return float(np.median(np.abs(level - mean[point])[several])) if several.any() else 0.0
+    return cloud_shadows.apart(point, level)

@@ -122,6 +122,7 @@ def map_key(
         dict(exposure.fields),
         dict(exposure.offsets),
         dict(exposure.patterns),
+        dict(exposure.shades),
         None if labels is None else labels.photo,
     )
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from skyquilt.simulate.camera import Lens
+from skyquilt.simulate.clouds import Clouds
 from skyquilt.simulate.flight import Shot
 from skyquilt.simulate.grid import Doubles, Floats, Grid
 from skyquilt.simulate.horizon import with_horizon
@@ -107,11 +108,12 @@ class Exposer:
         rng: np.random.Generator,
         weather: Weather | None = None,
         smoke: Smoke | None = None,
+        clouds: Clouds | None = None,
     ) -> NDArray[np.uint8]:
         """The visible image (h, w, 3) as the camera stores it; `weather`: another moment than that
-        of the scene; `smoke` that drifts over it.
+        of the scene; `smoke` that drifts over it; `clouds` that shade it.
         """
-        seen = self.colours(shot, rng, weather)
+        seen = self.colours(shot, rng, weather, clouds)
         if smoke is not None:
             veil = smoke.veil(self.directions, shot)[..., None]
             seen = seen * (1 - veil) + veil * GREY
@@ -122,10 +124,14 @@ class Exposer:
         return np.asarray(np.clip(seen + 0.5, 0, 255).astype(np.uint8))
 
     def colours(
-        self, shot: Shot, rng: np.random.Generator, weather: Weather | None = None
+        self,
+        shot: Shot,
+        rng: np.random.Generator,
+        weather: Weather | None = None,
+        clouds: Clouds | None = None,
     ) -> Floats:
         """Colours (h, w, 3), 0 to 255, of what lies in the way of each pixel's ray; `weather`:
-        another moment than that of the scene.
+        another moment than that of the scene; `clouds` that shade it.
         """
         hits, heights, window = self.pixels(shot)
         colours = (
@@ -135,6 +141,10 @@ class Exposer:
         )
         seen = sample(np.ascontiguousarray(colours), hits).astype(np.float32)
         seen *= self.flanks(hits, heights, window)[..., None]
+        if clouds is not None:
+            east, down = cv2.split(hits * np.float32(window.res))
+            x, y = np.float32(window.xs[0]) + east, np.float32(window.ys[0]) - down
+            seen *= clouds.light(x, y, shot.waypoint.time)[..., None]
         if self.scene.water is not None:
             place = hits * np.float32(window.res) + np.array([window.xs[0], -window.ys[0]])
             seen = with_waves(seen, place, heights <= self.scene.water + _WET_M, rng)

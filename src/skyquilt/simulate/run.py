@@ -11,6 +11,7 @@ import numpy as np
 from skyquilt.errors import OutputError
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.clip_tracks import add_track, track_in_clip
+from skyquilt.simulate.clouds import clouds_of
 from skyquilt.simulate.control import lay_out, observations, survey, write_gcp_list
 from skyquilt.simulate.exif import Body, write_jpeg, write_tiff
 from skyquilt.simulate.expose import exposer, footprint
@@ -311,6 +312,7 @@ def photograph(
     shaken = np.random.default_rng([world.settings.seed, 54]).permutation(len(flight.shots))
     spoilt = set(shaken[: pictures.blurred].tolist())
     smoke = smoke_of(pictures.fires, flight.shots, world.settings.seed)
+    clouds = clouds_of(pictures.clouds, world.settings.seed)
     sharp, shake = pictures, replace(pictures, motion_blur=pictures.blurred_px)
     for number, (shot, report) in enumerate(zip(flight.shots, flight.reports, strict=True)):
         if number % share[1] != share[0]:
@@ -320,7 +322,7 @@ def photograph(
         gain = float(np.exp(rng.normal(0, pictures.exposure_noise)))
         name = f"{shot.name}.jpg"
         if not (resume and (folder / name).exists()):
-            pixels = camera.visible(shot, pictures, gain, rng, _moment(world, shot), smoke)
+            pixels = camera.visible(shot, pictures, gain, rng, _moment(world, shot), smoke, clouds)
             if report.turned:
                 pixels = np.ascontiguousarray(pixels[::-1, ::-1])
             body = Body(
@@ -365,13 +367,15 @@ def _roll(
     camera = exposer(scene, flight.lens)
     times = np.array([s.waypoint.time for s in flight.shots])
     windy = gusts(times, video, settings.seed)
+    smoke = smoke_of(settings.pictures.fires, flight.shots, settings.seed)
+    clouds = clouds_of(settings.pictures.clouds, settings.seed)
     path = folder / "FLIGHT.MP4"
     writer = ClipWriter(path=path, fps=video.fps, lens=flight.lens)
     try:
         for number, shot in enumerate(flight.shots):
             rng = np.random.default_rng([settings.seed, 53, number])
             pictures = pictures_of(settings, video, gust=bool(windy[number])).pictures
-            writer.write(camera.visible(shot, pictures, 1.0, rng))
+            writer.write(camera.visible(shot, pictures, 1.0, rng, None, smoke, clouds))
             yield Progress(
                 stage="video", done=number + 1, total=len(flight.shots), name=f"{number:06d}"
             )

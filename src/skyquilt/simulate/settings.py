@@ -96,6 +96,8 @@ class Pictures:
     """Length of the blur along the flight, px."""
     fires: int = 0
     """Fires on the site, whose smoke drifts over it."""
+    clouds: float = 0.0
+    """Share of the ground in shadows of clouds that drift with the wind."""
     blurred: int = 0
     """Photos spoilt one by one, by a shake of the camera."""
     blurred_px: float = 16.0
@@ -417,6 +419,10 @@ def _other_rules(settings: FlightSettings) -> _Rules:
             f"at most all {settings.route.photos} photos can be blurred, not {pictures.blurred}",
         ),
         (0 <= pictures.fires <= 100, f"there can be 0 to 100 fires, not {pictures.fires}"),
+        (
+            0 <= pictures.clouds <= 0.9,
+            f"clouds must shade 0 to 90 % of the ground, not {100 * pictures.clouds:g} %",
+        ),
         (0 <= settings.route.wind <= 40, "wind must be 0 to 40 m/s"),
         (0 <= pictures.motion_blur <= 100, "motion blur must be 0 to 100 px"),
         (

@@ -32,8 +32,8 @@ _STEP_PX = 2
 
 
 @cache
-def _clouds() -> Floats:
-    """A periodic texture of zero mean and unit deviation."""
+def billows() -> Floats:
+    """A periodic texture (n, n) of zero mean and unit deviation, as smoke and clouds have it."""
     white = np.random.default_rng(11).standard_normal((_TEXTURE_PX, _TEXTURE_PX), np.float32)
     sigmas = (40, 22, 12, 6.5, 3.5, 2)
     layers = [gaussian_filter(white, s, mode="wrap") for s in sigmas]
@@ -81,7 +81,7 @@ def _thickness(drifted: Doubles, number: int) -> Floats:
     """Factor (h, w) by which clouds of a plume change its density, from places that drift along."""
     px = ((drifted / CLOUDS_M + 0.37 * number) % 1 * _TEXTURE_PX).astype(np.float32)
     x, y = cv2.split(px)
-    clouds = cv2.remap(_clouds(), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    clouds = cv2.remap(billows(), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
     return np.asarray(np.clip(1 + 0.9 * clouds, 0, 4), np.float32)
 
 

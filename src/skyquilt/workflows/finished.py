@@ -182,6 +182,7 @@ def _exposure(exposure: Exposure, where: Mapping[int, int]) -> Exposure:
         fields=moved(exposure.fields),
         offsets=moved(exposure.offsets),
         patterns=moved(exposure.patterns),
+        shades=moved(exposure.shades),
     )
 
 

@@ -82,6 +82,7 @@ def labels_key(
         ground.grid,
         dict(exposure.gains),
         dict(exposure.fields),
+        dict(exposure.shades),
         methods.seams,
         picture_recipe(),
         [p.pixels_key for p in photos],

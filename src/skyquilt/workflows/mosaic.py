@@ -401,7 +401,7 @@ def _metrics(
                 *tilt_warnings(aligned.priors, alignment, settings.picture.max_view_angle),
                 *stretch_warnings(alignment.frame),
             ],
-            notes=[*survey.notes, *alignment.notes, *ground.notes],
+            notes=[*survey.notes, *alignment.notes, *ground.notes, *map_.exposure.notes],
         )
         | {
             "heights": height_figures(
