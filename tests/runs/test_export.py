@@ -141,6 +141,7 @@ def test_web_tiles_and_mbtiles_and_kmz_show_the_same_ground(finished, exported):
     assert abs(west - lon) < 1e-6 and abs(north - lat) < 1e-6
     with zipfile.ZipFile(folder / "mosaic.kmz") as archive:
         assert archive.testzip() is None and archive.namelist()[0] == "doc.kml"
+        assert not any(b".." in archive.read(i) for i in archive.namelist() if i.endswith(".kml"))
         # equal maps give equal files
         assert {i.date_time for i in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
 

@@ -25,18 +25,20 @@ PULL = 0.1
 """Weight of the prior of no change, in samples."""
 ROUNDS, WHOLE = 20, 3
 """Rounds, and how many of the first take shadows for what they are, not for outliers."""
-WIDE, CLOSE, LEAST = 0.5, 2.0, 0.02
+WIDE, CLOSE, LEAST = 0.5, 2.0, 0.1
 """Residual in log odds at which a sample counts half, in the first rounds; later in medians of the
 residuals, and at least.
 """
-DIFFERENT = 0.04
-"""Median difference of samples from the mean of their point, in log odds, below which nothing is
-sought.
+DIFFERENT, FEWEST = 0.05, 20
+"""Mean difference of a photo's samples from the mean of their point, in log odds, and number of
+such samples, below which no shadows are sought in it.
 """
-EXPLAINED, SURELY = 0.25, 0.35
+EXPLAINED, SURELY = 0.25, 0.4
 """Share of these differences that shades must explain at points they were not found from: of few
 samples, and of `DENSE` ones.
 """
+TOGETHER = 2
+"""Photos with shadows, at least: one alone differs by something else."""
 DENSE, MOST = 1200, 2_400_000
 """Samples of a photo for the shades that are used, and of all photos together."""
 
@@ -46,11 +48,13 @@ def shades(
     row: NDArray[np.integer[Any]],
     place: Float,
     level: NDArray[Any],
-    photos: int,
+    free: NDArray[np.bool_],
 ) -> Float:
-    """(photos, `NODES`, `NODES`) what is to be added to samples of points (N,) in photos `row` (N,)
-    at places (N, 2), as of `exposure.image_place`, so that levels (N,) of each point are alike.
+    """(n, `NODES`, `NODES`) what is to be added to samples of points (N,) in photos `row` (N,) at
+    places (N, 2), as of `exposure.image_place`, so that levels (N,) of each point are alike; zero
+    for photos that are not `free` (n,).
     """
+    photos = len(free)
     terms = _bilinear(place)
     found = np.zeros((photos, NODES, NODES))
     several = np.bincount(point)[point] > 1
@@ -69,7 +73,7 @@ def shades(
             _soft(sum(np.bincount(first + at, f * w, found.size) for at, f in terms), found.shape)
             for w in (weight * lacking, weight)
         )
-        found += total / (share + PULL)
+        found[free] += (total / (share + PULL))[free]
     return found.astype(np.float32)
 
 
@@ -79,19 +83,24 @@ def explained(
     place: Float,
     level: NDArray[Any],
     photos: int,
-) -> float:
-    """Share of the median difference of samples from the mean of their point that shades explain
-    which were found from every other point; arguments as of `shades`.
+) -> NDArray[np.float64]:
+    """(photos,) share of the mean difference of a photo's samples from the mean of their point that
+    shades explain which were found from every other point; 0 where they hardly differ. Arguments as
+    of `shades`.
     """
-    rest, whole = 0.0, 0.0
+    number, whole, rest = (np.zeros(photos) for _ in range(3))
     for known in (point % 2 == 0, point % 2 == 1):
         if not known.any() or known.all():
-            return 0.0
-        found = shades(point[known], row[known], place[known], level[known], photos)
+            continue
+        free = np.ones(photos, bool)
+        found = shades(point[known], row[known], place[known], level[known], free)
         p, r, y = point[~known], row[~known], level[~known]
-        whole += apart(p, y)
-        rest += apart(p, y + shade(found, r, place[~known]))
-    return 1 - rest / max(whole, 1e-9)
+        before, several = _off(p, y)
+        after, _ = _off(p, y + shade(found, r, place[~known]))
+        for total, part in ((number, several), (whole, before), (rest, after)):
+            total += np.bincount(r, part, photos)
+    differ = (number >= FEWEST) & (whole > DIFFERENT * number)
+    return np.where(differ, 1 - rest / np.maximum(whole, 1e-9), 0.0)
 
 
 def shade(found: NDArray[Any], row: NDArray[np.integer[Any]], place: NDArray[Any]) -> Float:
@@ -107,10 +116,20 @@ def over(found: Float, x: NDArray[Any], y: NDArray[Any]) -> Float:
 
 def apart(point: NDArray[np.integer[Any]], level: NDArray[Any]) -> float:
     """Median difference of samples (N,) from the mean of their point (N,)."""
+    off, several = _off(point, level)
+    return float(np.median(off[several])) if several.any() else 0.0
+
+
+def _off(
+    point: NDArray[np.integer[Any]], level: NDArray[Any]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """(N,) how far samples are from the mean of their point, 0 for its only one, and (N,) which
+    are not the only ones.
+    """
     number = np.bincount(point)
     mean = np.bincount(point, level) / np.maximum(number, 1)
     several = number[point] > 1
-    return float(np.median(np.abs(level - mean[point])[several])) if several.any() else 0.0
+    return np.where(several, np.abs(level - mean[point]), 0.0), several
 
 
 def _bilinear(place: NDArray[Any]) -> list[tuple[NDArray[np.int64], NDArray[np.float64]]]:

@@ -209,18 +209,15 @@ class Balance:
         if not len(samples.point):
             return NEUTRAL
         best = self._found(samples, usable, keep)
-        if not _clouded(samples, best, usable, cloud_shadows.EXPLAINED):
+        if not _clouded(samples, best, usable, cloud_shadows.EXPLAINED).any():
             return best
         each = min(cloud_shadows.DENSE, cloud_shadows.MOST // len(usable))
         wanted = int(samples.sought * each * len(usable) / len(samples.point))
         dense = replace(self, points=max(wanted, int(samples.sought)))
-        samples = dense.samples(usable, thumbnails, surface, bounds, keep)
-        if not _clouded(samples, best, usable, cloud_shadows.SURELY):
-            return best
-        samples = samples.under(best.white)
-        level = samples.level(best, usable)
-        found = cloud_shadows.shades(samples.point, samples.row, samples.place, level, len(usable))
-        return replace(best, shades=dict(zip((v.photo for v in usable), found, strict=True)))
+        s = dense.samples(usable, thumbnails, surface, bounds, keep).under(best.white)
+        free = _clouded(s, best, usable, cloud_shadows.SURELY)
+        found = cloud_shadows.shades(s.point, s.row, s.place, s.level(best, usable), free)
+        return replace(best, shades={usable[k].photo: found[k] for k in np.flatnonzero(free)})
 
     def _found(self, samples: "Samples", views: Sequence[View], keep: Keep) -> Exposure:
         """Gains and fields, with the weights and the response that fit."""
@@ -469,15 +466,17 @@ class Samples:
         return float(np.mean([cloud_shadows.apart(self.point, levels) for levels in bands]))
 
 
-def _clouded(samples: Samples, found: Exposure, views: Sequence[View], least: float) -> bool:
-    """Whether what is left between photos looks like moving shadows of clouds: whether smooth
-    shades explain this share of it.
+def _clouded(
+    samples: Samples, found: Exposure, views: Sequence[View], least: float
+) -> NDArray[np.bool_]:
+    """(n,) which photos show moving shadows of clouds: smooth shades explain at least this share of
+    what is left between them and others.
     """
     s = samples.under(found.white)
     level = s.level(found, views)
-    if cloud_shadows.apart(s.point, level) < cloud_shadows.DIFFERENT:
-        return False
-    return cloud_shadows.explained(s.point, s.row, s.place, level, len(views)) > least
+    share = cloud_shadows.explained(s.point, s.row, s.place, level, len(views))
+    shaded = share > least
+    return np.asarray(shaded & (shaded.sum() >= cloud_shadows.TOGETHER))
 
 
 def _around(view: View, x: NDArray[Any], y: NDArray[Any]) -> tuple[slice, slice]:

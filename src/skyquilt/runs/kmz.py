@@ -94,7 +94,7 @@ def write_kmz(
     pyramid = _Pyramid(source=source, layer=layer, scale=scale, part=part, levels=levels)
     with whole_file(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         name = escape(f"{title} - {layer.title}")
-        link = _link((0, 0, 0), pyramid, "")
+        link = _link((0, 0, 0), pyramid)
         doc = f"{HEAD}<Document><name>{name}</name>{link}</Document></kml>\n"
         _put(archive, "doc.kml", doc)
         _write(archive, pyramid, (0, 0, 0))
@@ -109,12 +109,12 @@ def _write(archive: zipfile.ZipFile, pyramid: _Pyramid, at: Address) -> bool:
     clear = bool((rgba[..., 3] == 0).any())
     kind, ending = ("image/png", "png") if clear else ("image/jpeg", "jpg")
     level, row, column = at
-    name = f"{level}/{row}-{column}"
+    name = f"{level}-{row}-{column}"
     _put(archive, f"{name}.{ending}", image_bytes(rgba, kind))
-    links = "".join(_link(c, pyramid, "../") for c in below)
+    links = "".join(_link(c, pyramid) for c in below)
     overlay = (
         f"<GroundOverlay><drawOrder>{level}</drawOrder>"
-        f"<Icon><href>{row}-{column}.{ending}</href></Icon>"
+        f"<Icon><href>{name}.{ending}</href></Icon>"
         f"<LatLonBox>{_edges(pyramid.box(at))}</LatLonBox></GroundOverlay>"
     )
     region = _region(pyramid.box(at), 128 if level else 0)
@@ -129,11 +129,12 @@ def _put(archive: zipfile.ZipFile, name: str, content: str | bytes) -> None:
     archive.writestr(about, content)
 
 
-def _link(at: Address, pyramid: _Pyramid, up: str) -> str:
+def _link(at: Address, pyramid: _Pyramid) -> str:
+    # all files lie side by side: GDAL since 3.12 refuses links with ".."
     level, row, column = at
     region = _region(pyramid.box(at), 128 if level else 0)
     return (
-        f"<NetworkLink>{region}<Link><href>{up}{level}/{row}-{column}.kml</href>"
+        f"<NetworkLink>{region}<Link><href>{level}-{row}-{column}.kml</href>"
         "<viewRefreshMode>onRegion</viewRefreshMode></Link></NetworkLink>"
     )
 
