@@ -78,8 +78,10 @@ class Exposure:
         if not self.shades:
             return ()
         return (
-            "Shadows of clouds moved over the ground during the flight. They are evened out where"
-            " photos differ; what all photos of a place, or its only one, show in shadow stays so.",
+            f"{len(self.shades)} photos show parts of the ground in other light than their"
+            " neighbours: shadows of clouds that moved, thin smoke, or plants seen from the sun's"
+            " side and from the other. That is evened out where photos differ; what all photos of a"
+            " place, or its only one, show in shadow stays so.",
         )
 
     def odds(self, photo: int, x: Float, y: Float) -> Float:
@@ -209,13 +211,14 @@ class Balance:
         if not len(samples.point):
             return NEUTRAL
         best = self._found(samples, usable, keep)
-        if not _clouded(samples, best, usable, cloud_shadows.EXPLAINED).any():
+        if not _clouded(samples.unmarked(usable), best, usable, cloud_shadows.EXPLAINED).any():
             return best
         each = min(cloud_shadows.DENSE, cloud_shadows.MOST // len(usable))
         wanted = int(samples.sought * each * len(usable) / len(samples.point))
         dense = replace(self, points=max(wanted, int(samples.sought)))
-        s = dense.samples(usable, thumbnails, surface, bounds, keep).under(best.white)
+        s = dense.samples(usable, thumbnails, surface, bounds, keep).unmarked(usable)
         free = _clouded(s, best, usable, cloud_shadows.SURELY)
+        s = s.under(best.white)
         found = cloud_shadows.shades(s.point, s.row, s.place, s.level(best, usable), free)
         return replace(best, shades={usable[k].photo: found[k] for k in np.flatnonzero(free)})
 
@@ -438,6 +441,23 @@ class Samples:
         """The same, of another response."""
         return replace(self, white=white)
 
+    def unmarked(self, views: Sequence[View]) -> "Samples":
+        """Those that are not in parts of photos that show marks, smoke or the like."""
+        kept = np.ones(len(self.row), bool)
+        for k, view in enumerate(views):
+            if (mark := view.limits.mark) is not None:
+                own = np.flatnonzero(self.row == k)
+                kept[own] = mark.at(*image_pixels(view, *self.place[own].T)) > 0
+        if kept.all():
+            return self
+        return replace(
+            self,
+            point=self.point[kept],
+            row=self.row[kept],
+            place=self.place[kept],
+            value=self.value[kept],
+        )
+
     def field(self, terms: NDArray[Any]) -> Float:
         """(N,) the field of each sample's photo at its place, from terms (n, 6) of the photos."""
         out = np.zeros(len(self.row), np.float32)
@@ -498,6 +518,13 @@ def image_place(view: View, u: NDArray[Any], v: NDArray[Any]) -> tuple[NDArray[A
         np.clip((p - n / 2) / half, -0.55 * n / half, 0.55 * n / half) for p, n in ((u, w), (v, h))
     )
     return x, y
+
+
+def image_pixels(view: View, x: NDArray[Any], y: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Photo columns and rows of places x, y of `image_place`."""
+    w, h = view.camera.width - 1.0, view.camera.height - 1.0
+    half = np.hypot(w, h) / 2
+    return x * half + w / 2, y * half + h / 2
 
 
 def _corners(view: View) -> tuple[NDArray[Any], NDArray[Any]]:
