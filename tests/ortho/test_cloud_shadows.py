@@ -73,10 +73,10 @@ def test_shadows_of_a_few_photos_are_found_and_others_hardly_change():
     from; photos that do not overlap with these stay.
     """
     point, row, place, level, dark = flight(6, 0.9)
-    few = np.isin(row, (5, 6, 9))
+    few = np.isin(row, (0, 1))
     level = np.where(few, level, level + dark)
     found = explained(point, row, place, level, PHOTOS) > SURELY
-    assert {5, 6, 9} <= set(np.flatnonzero(found)) <= set(range(16)) - {3, 12, 15}
+    assert {0, 1} <= set(np.flatnonzero(found)) <= {0, 1, 2, 4, 5, 6}
     drawn = shades(point, row, place, level, found)
     assert not drawn[~found].any()
     size = np.abs(shade(drawn, row, place))

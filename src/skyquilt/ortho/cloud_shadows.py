@@ -29,11 +29,11 @@ WIDE, CLOSE, LEAST = 0.5, 2.0, 0.1
 """Residual in log odds at which a sample counts half, in the first rounds; later in medians of the
 residuals, and at least.
 """
-DIFFERENT, FEWEST = 0.05, 20
+DIFFERENT, FEWEST = 0.025, 20
 """Mean difference of a photo's samples from the mean of their point, in log odds, and number of
 such samples, below which no shadows are sought in it.
 """
-EXPLAINED, SURELY = 0.25, 0.4
+EXPLAINED, SURELY = 0.25, 0.33
 """Share of these differences that shades must explain at points they were not found from: of few
 samples, and of `DENSE` ones.
 """
@@ -132,11 +132,11 @@ def _off(
     return np.where(several, np.abs(level - mean[point]), 0.0), several
 
 
-def _bilinear(place: NDArray[Any]) -> list[tuple[NDArray[np.int64], NDArray[np.float64]]]:
+def _bilinear(place: NDArray[Any]) -> list[tuple[NDArray[np.int32], Float]]:
     """Node and weight (N,) of each of the four nodes around places (N, 2)."""
     at = np.clip((place + REACH) * ((NODES - 1) / (2 * REACH)), 0, NODES - 1.001)
-    base = at.astype(np.int64)
-    x, y = (at - base).T
+    base = at.astype(np.int32)
+    x, y = (at - base).astype(np.float32).T
     node = base[:, 1] * NODES + base[:, 0]
     return [
         (node, (1 - x) * (1 - y)),
@@ -147,9 +147,7 @@ def _bilinear(place: NDArray[Any]) -> list[tuple[NDArray[np.int64], NDArray[np.f
 
 
 def _at(
-    found: NDArray[Any],
-    terms: list[tuple[NDArray[np.int64], NDArray[np.float64]]],
-    first: NDArray[np.int64],
+    found: NDArray[Any], terms: list[tuple[NDArray[np.int32], Float]], first: NDArray[np.int64]
 ) -> NDArray[np.float64]:
     flat = found.ravel()
     return np.asarray(sum(flat[first + node] * weight for node, weight in terms))

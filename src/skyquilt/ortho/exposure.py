@@ -79,9 +79,9 @@ class Exposure:
             return ()
         return (
             f"{len(self.shades)} photos show parts of the ground in other light than their"
-            " neighbours: shadows of clouds that moved, thin smoke, or plants seen from the sun's"
-            " side and from the other. That is evened out where photos differ; what all photos of a"
-            " place, or its only one, show in shadow stays so.",
+            " neighbours: shadows of clouds that moved, a sun that moved on, thin smoke, or plants"
+            " seen from the sun's side and from the other. That is evened out where photos differ;"
+            " what all photos of a place, or its only one, show in shadow stays so.",
         )
 
     def odds(self, photo: int, x: Float, y: Float) -> Float:
