@@ -12,7 +12,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.imaging import node_grid
+from skyquilt.imaging.node_grid import nodes_around
+
 Float = NDArray[np.float32]
+Terms = list[tuple[NDArray[np.int32], Float]]
 
 NODES = 14
 """Nodes along either side of a square about the picture: at 1.1 of the half diagonal at its sides.
@@ -54,9 +58,8 @@ def shades(
     places (N, 2), as of `exposure.image_place`, so that levels (N,) of each point are alike; zero
     for photos that are not `free` (n,).
     """
-    photos = len(free)
-    terms = _bilinear(place)
-    found = np.zeros((photos, NODES, NODES))
+    terms = _terms(place)
+    found = np.zeros((len(free), NODES, NODES))
     several = np.bincount(point)[point] > 1
     weight = several.astype(float)
     first = row.astype(np.int64) * NODES**2
@@ -66,7 +69,7 @@ def shades(
         lacking = (np.bincount(point, weight * now) / mass)[point] - now
         lacking[~several] = 0
         scale = WIDE
-        if step >= WHOLE:
+        if step >= WHOLE and several.any():
             scale = max(CLOSE * float(np.median(np.abs(lacking[several]))), LEAST)
         weight = several / (1 + (lacking / scale) ** 2)
         total, share = (
@@ -88,30 +91,29 @@ def explained(
     shades explain which were found from every other point; 0 where they hardly differ. Arguments as
     of `shades`.
     """
-    number, whole, rest = (np.zeros(photos) for _ in range(3))
-    for known in (point % 2 == 0, point % 2 == 1):
-        if not known.any() or known.all():
-            continue
-        free = np.ones(photos, bool)
-        found = shades(point[known], row[known], place[known], level[known], free)
-        p, r, y = point[~known], row[~known], level[~known]
-        before, several = _off(p, y)
-        after, _ = _off(p, y + shade(found, r, place[~known]))
-        for total, part in ((number, several), (whole, before), (rest, after)):
-            total += np.bincount(r, part, photos)
+    before, several = _off(point, level)
+    number, whole = (np.bincount(row, of, photos) for of in (several, before))
     differ = (number >= FEWEST) & (whole > DIFFERENT * number)
+    even = point % 2 == 0
+    if not differ.any() or even.all() or not even.any():
+        return np.zeros(photos)
+    rest, free = np.zeros(photos), np.ones(photos, bool)
+    for known in (even, ~even):
+        found = shades(point[known], row[known], place[known], level[known], free)
+        p, r = point[~known], row[~known]
+        after, _ = _off(p, level[~known] + shade(found, r, place[~known]))
+        rest += np.bincount(r, after, photos)
     return np.where(differ, 1 - rest / np.maximum(whole, 1e-9), 0.0)
 
 
 def shade(found: NDArray[Any], row: NDArray[np.integer[Any]], place: NDArray[Any]) -> Float:
     """(N,) shades of photos `row` (N,) at places (N, 2)."""
-    return np.asarray(_at(found, _bilinear(place), row.astype(np.int64) * NODES**2), np.float32)
+    return np.asarray(_at(found, _terms(place), row.astype(np.int64) * NODES**2), np.float32)
 
 
 def over(found: Float, x: NDArray[Any], y: NDArray[Any]) -> Float:
     """(h, w) one photo's shades (`NODES`, `NODES`) at places x, y (h, w)."""
-    u, v = (((p + REACH) * ((NODES - 1) / (2 * REACH))).astype(np.float32) for p in (x, y))
-    return np.asarray(cv2.remap(found, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+    return node_grid.over(found, _shares(x), _shares(y))
 
 
 def apart(point: NDArray[np.integer[Any]], level: NDArray[Any]) -> float:
@@ -132,23 +134,19 @@ def _off(
     return np.where(several, np.abs(level - mean[point]), 0.0), several
 
 
-def _bilinear(place: NDArray[Any]) -> list[tuple[NDArray[np.int32], Float]]:
+def _shares(place: NDArray[Any]) -> NDArray[Any]:
+    """Places in shares of the sides of the square of nodes."""
+    return np.asarray((place + REACH) / (2 * REACH))
+
+
+def _terms(place: NDArray[Any]) -> Terms:
     """Node and weight (N,) of each of the four nodes around places (N, 2)."""
-    at = np.clip((place + REACH) * ((NODES - 1) / (2 * REACH)), 0, NODES - 1.001)
-    base = at.astype(np.int32)
-    x, y = (at - base).astype(np.float32).T
-    node = base[:, 1] * NODES + base[:, 0]
-    return [
-        (node, (1 - x) * (1 - y)),
-        (node + 1, x * (1 - y)),
-        (node + NODES, (1 - x) * y),
-        (node + NODES + 1, x * y),
-    ]
+    around = nodes_around(_shares(place), (NODES, NODES))
+    return [(node.astype(np.int32), weight.astype(np.float32)) for node, weight in around]
 
 
-def _at(
-    found: NDArray[Any], terms: list[tuple[NDArray[np.int32], Float]], first: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def _at(found: NDArray[Any], terms: Terms, first: NDArray[np.int64]) -> NDArray[np.float64]:
+    """(N,) values of grids (n, `NODES`, `NODES`), of samples whose grids begin at `first` (N,)."""
     flat = found.ravel()
     return np.asarray(sum(flat[first + node] * weight for node, weight in terms))
 

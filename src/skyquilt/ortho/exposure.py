@@ -189,7 +189,7 @@ class Balance:
     """Least share of the differences between photos that fields must explain to be applied."""
     whites: tuple[float, ...] = WHITES
     """Values at which the cameras' response may end; the survey's overlaps decide."""
-    version: ClassVar[int] = 10
+    version: ClassVar[int] = 11
 
     def under(self, white: float) -> "Balance":
         """The same for a response that is known."""
@@ -211,15 +211,19 @@ class Balance:
         if not len(samples.point):
             return NEUTRAL
         best = self._found(samples, usable, keep)
-        if not _clouded(samples.unmarked(usable), best, usable, cloud_shadows.EXPLAINED).any():
+        few = samples.unmarked(usable).under(best.white)
+        if not _clouded(few, few.level(best, usable), len(usable), cloud_shadows.EXPLAINED).any():
             return best
         each = min(cloud_shadows.DENSE, cloud_shadows.MOST // len(usable))
         wanted = int(samples.sought * each * len(usable) / len(samples.point))
         dense = replace(self, points=max(wanted, int(samples.sought)))
         s = dense.samples(usable, thumbnails, surface, bounds, keep).unmarked(usable)
-        free = _clouded(s, best, usable, cloud_shadows.SURELY)
         s = s.under(best.white)
-        found = cloud_shadows.shades(s.point, s.row, s.place, s.level(best, usable), free)
+        level = s.level(best, usable)
+        free = _clouded(s, level, len(usable), cloud_shadows.SURELY)
+        if not free.any():
+            return best
+        found = cloud_shadows.shades(s.point, s.row, s.place, level, free)
         return replace(best, shades={usable[k].photo: found[k] for k in np.flatnonzero(free)})
 
     def _found(self, samples: "Samples", views: Sequence[View], keep: Keep) -> Exposure:
@@ -444,9 +448,10 @@ class Samples:
     def unmarked(self, views: Sequence[View]) -> "Samples":
         """Those that are not in parts of photos that show marks, smoke or the like."""
         kept = np.ones(len(self.row), bool)
+        ends = np.searchsorted(self.row, np.arange(len(views) + 1))  # samples lie photo by photo
         for k, view in enumerate(views):
             if (mark := view.limits.mark) is not None:
-                own = np.flatnonzero(self.row == k)
+                own = slice(ends[k], ends[k + 1])
                 kept[own] = mark.at(*image_pixels(view, *self.place[own].T)) > 0
         if kept.all():
             return self
@@ -486,16 +491,11 @@ class Samples:
         return float(np.mean([cloud_shadows.apart(self.point, levels) for levels in bands]))
 
 
-def _clouded(
-    samples: Samples, found: Exposure, views: Sequence[View], least: float
-) -> NDArray[np.bool_]:
-    """(n,) which photos show moving shadows of clouds: smooth shades explain at least this share of
-    what is left between them and others.
+def _clouded(s: Samples, level: Float, photos: int, least: float) -> NDArray[np.bool_]:
+    """(photos,) which show moving shadows of clouds: smooth shades explain at least this share of
+    what is left between them and others, of samples with these levels (N,).
     """
-    s = samples.under(found.white)
-    level = s.level(found, views)
-    share = cloud_shadows.explained(s.point, s.row, s.place, level, len(views))
-    shaded = share > least
+    shaded = cloud_shadows.explained(s.point, s.row, s.place, level, photos) > least
     return np.asarray(shaded & (shaded.sum() >= cloud_shadows.TOGETHER))
 
 

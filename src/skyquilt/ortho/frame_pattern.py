@@ -8,10 +8,10 @@ differ by what hangs on these places alone, that is the camera's, not the ground
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.imaging.node_grid import nodes_around, over
 from skyquilt.model.camera import Camera
 
 Doubles = NDArray[np.float64]
@@ -178,21 +178,10 @@ def _bilinear(place: Doubles, shape: tuple[int, int]) -> Any:
     """(N, h w) sparse weights of the nodes at places (N, 2) in shares of the sides."""
     from scipy import sparse
 
-    height, width = shape
-    x, y = (np.clip(p, 0, 1) * (n - 1) for p, n in zip(place.T, (width, height), strict=True))
-    left, top = (
-        np.minimum(np.floor(p).astype(np.int64), n - 2) for p, n in ((x, width), (y, height))
-    )
-    right, low = x - left, y - top
-    number = np.arange(len(x))
-    at = top * width + left
-    return sparse.csr_matrix(
-        (
-            np.r_[(1 - right) * (1 - low), right * (1 - low), (1 - right) * low, right * low],
-            (np.tile(number, 4), np.r_[at, at + 1, at + width, at + width + 1]),
-        ),
-        (len(x), height * width),
-    )
+    around = nodes_around(place, shape)
+    number = np.tile(np.arange(len(place)), len(around))
+    nodes, weights = (np.concatenate(parts) for parts in zip(*around, strict=True))
+    return sparse.csr_matrix((weights, (number, nodes)), (len(place), shape[0] * shape[1]))
 
 
 def _radial(shape: tuple[int, int], rings: int) -> Any:
@@ -242,14 +231,4 @@ def at(
     pattern: NDArray[np.float32], u: NDArray[Any], v: NDArray[Any], width: int, height: int
 ) -> NDArray[np.float32]:
     """The pattern at columns u and rows v (h, w) of a frame of this size."""
-    x = np.clip((u + 0.5) / width, 0, 1) * (pattern.shape[1] - 1)
-    y = np.clip((v + 0.5) / height, 0, 1) * (pattern.shape[0] - 1)
-    return np.asarray(
-        cv2.remap(
-            pattern,
-            x.astype(np.float32),
-            y.astype(np.float32),
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
-    )
+    return over(pattern, (u + 0.5) / width, (v + 0.5) / height)

@@ -2,12 +2,11 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.simulate.grid import Doubles, Floats
-from skyquilt.simulate.smoke import billows
+from skyquilt.simulate.smoke import billows, billows_at
 
 DARKER = 0.55
 """Share of the light that a cloud takes."""
@@ -31,14 +30,9 @@ class Clouds:
 
     def light(self, x: Floats, y: Floats, time: float) -> Floats:
         """Factor (h, w) on the light at places x, y (h, w), m on the map, after so many seconds."""
-        texture = billows()
-        level = float(np.quantile(texture, 1 - self.share))
+        level = float(np.quantile(billows(), 1 - self.share))
         moved = self.start + self.downwind * (WIND_MS * time)
-        u, v = (
-            (((p - off) / PERIOD_M) % 1 * texture.shape[0]).astype(np.float32)
-            for p, off in ((x, moved[0]), (y, moved[1]))
-        )
-        thick = cv2.remap(texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        thick = billows_at((x - moved[0]) / PERIOD_M, (y - moved[1]) / PERIOD_M)
         shadow = 1 / (1 + np.exp(-(thick - level) / EDGE))
         return np.asarray(1 - DARKER * shadow, np.float32)
 

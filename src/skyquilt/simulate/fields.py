@@ -108,6 +108,7 @@ def _rows(
     wave = np.cos(across * _per_cell([2 * np.pi / c.spacing for c in covers], index))
     tall = _per_cell([c.height for c in covers], index)
     offset = np.abs(np.mod(across, 18.0) - np.float32(9.0))
+    # ripples of sand have no tracks
     track = ((np.abs(offset - np.float32(0.9)) < 0.22) & (tall > 0.1)).astype(np.float32)
     gaps = np.clip(canvas.patchy - np.float32(1.9), 0, 1) * (contrast > 0.15)
     height = tall * (1 - track) * (0.75 + 0.25 * wave) + 0.12 * tall * canvas.fine

@@ -3,9 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from skyquilt.simulate.flight import Shot
@@ -39,6 +41,12 @@ def billows() -> Floats:
     layers = [gaussian_filter(white, s, mode="wrap") for s in sigmas]
     whole = sum(0.55**k * layer / layer.std() for k, layer in enumerate(layers))
     return np.asarray((whole - np.mean(whole)) / np.std(whole), np.float32)
+
+
+def billows_at(x: NDArray[Any], y: NDArray[Any]) -> Floats:
+    """The texture at places x, y (h, w), in its periods."""
+    u, v = ((p % 1 * _TEXTURE_PX).astype(np.float32) for p in (x, y))
+    return np.asarray(cv2.remap(billows(), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -79,9 +87,7 @@ class Smoke:
 
 def _thickness(drifted: Doubles, number: int) -> Floats:
     """Factor (h, w) by which clouds of a plume change its density, from places that drift along."""
-    px = ((drifted / CLOUDS_M + 0.37 * number) % 1 * _TEXTURE_PX).astype(np.float32)
-    x, y = cv2.split(px)
-    clouds = cv2.remap(billows(), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    clouds = billows_at(*cv2.split(drifted / CLOUDS_M + 0.37 * number))
     return np.asarray(np.clip(1 + 0.9 * clouds, 0, 4), np.float32)
 
 
