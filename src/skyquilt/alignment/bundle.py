@@ -31,6 +31,7 @@ from skyquilt.alignment.outcome import (
 )
 from skyquilt.alignment.problem import Problem, State
 from skyquilt.alignment.repairs import begun_with, repaired
+from skyquilt.alignment.same_lens import as_of_sizes, lenses_of_sizes
 from skyquilt.alignment.setup import Setup, camera_records, pose_records, priors_by_camera, set_up
 from skyquilt.alignment.stages import fine_steps, plain, rough_steps, settled, spinning, weighed
 from skyquilt.alignment.start import Start, find_start, focals_by_heights, ground_of, with_focals
@@ -91,7 +92,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 93
+    version: ClassVar[int] = 94
 
     def __call__(
         self,
@@ -115,7 +116,8 @@ class Bundle:
         """
 
         def taken(begun: Beginning) -> Sequence[Photo]:
-            own = with_focals(photos, begun.focals) if begun.focals else photos
+            own = as_of_sizes(photos, begun.sizes) if begun.sizes else photos
+            own = with_focals(own, begun.focals) if begun.focals else own
             own = as_of_lenses(own, begun.lenses) if begun.lenses else own
             return as_enlarged(own, begun.enlarged) if begun.enlarged else own
 
@@ -145,6 +147,7 @@ class Bundle:
             speeds=speeds_of(photos),
             linked=len({i for k in links for i in (k.a, k.b)}),
             adjust=adjust,
+            sizes=lambda: lenses_of_sizes(photos),
             unfit=lambda t: unfit_cameras(t.found, priors_of(t)),
             cut=lambda t: cut_cameras(t.found, priors_of(t)),
             wholes=lambda t: whole_focals(t.found, t.begun.cut & doubtful, t.begun.focals),

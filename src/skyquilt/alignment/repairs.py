@@ -35,6 +35,7 @@ from skyquilt.alignment.oblique_start import (
     turned_priors,
     untold,
 )
+from skyquilt.alignment.same_lens import sizes_note, unlike
 from skyquilt.alignment.tries import Beginning, Survey, Tried
 from skyquilt.alignment.unfit_cameras import (
     cut_notes,
@@ -100,6 +101,20 @@ def repaired(first: Tried, survey: Survey) -> Tried:
     cut, loose = (cameras & found.cameras.keys() for cameras in (begun.cut, begun.loose))
     said = (*cut_notes(found, cut), *unfit_notes(found, loose))
     return replace(first, notes=(*first.notes, *said))
+
+
+def _one_lens(last: Tried, survey: Survey) -> Tried:
+    """Pictures of several sizes that one lens took are calibrated together. A part that was cut
+    out is no smaller picture of the whole: then photos fit worse, or contradict it.
+    """
+    sizes = survey.sizes() if len(set(survey.cameras)) > 1 else {}
+    if not sizes:
+        return last
+    other = survey.tried(last.begun, sizes=sizes, name="sizes ")
+    false = unlike(other.found, survey.cameras, sizes, last.begun.priors)
+    if false or not fits_as_well(other.found, last.found):
+        return last
+    return replace(other, notes=(*last.notes, sizes_note(sizes)))
 
 
 def _guessed_focals(last: Tried, survey: Survey) -> Tried:
@@ -409,6 +424,7 @@ def _if_nearer(
 
 
 REPAIRS: tuple[Callable[[Tried, Survey], Tried], ...] = (
+    _one_lens,
     _guessed_focals,
     _false_views,
     _mirrored_positions,

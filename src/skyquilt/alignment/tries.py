@@ -6,6 +6,7 @@ from typing import Any
 
 from skyquilt.alignment.motion import Speeds
 from skyquilt.alignment.oblique_start import Beginnings
+from skyquilt.model.photo import Zoom
 from skyquilt.model.poses import Alignment, Prior
 
 
@@ -19,6 +20,8 @@ class Beginning:
     """The same with guessed directions of the cameras."""
     aside: frozenset[int] = frozenset()
     """Photos that are not adjusted, but hung on the others afterwards."""
+    sizes: Mapping[str, Zoom] = field(default_factory=dict)
+    """Cameras whose pictures differ from others of one lens by their size (`same_lens`)."""
     enlarged: Mapping[int, float] = field(default_factory=dict)
     """Factors of photos that are enlarged against others of their camera."""
     lenses: Mapping[int, int] = field(default_factory=dict)
@@ -66,6 +69,8 @@ class Survey:
     """How many photos have links."""
     adjust: Callable[[Beginning], Alignment]
     """Adjusts the survey."""
+    sizes: Callable[[], Mapping[str, Zoom]]
+    """Cameras whose pictures differ from others by their size alone (`lenses_of_sizes`)."""
     unfit: Callable[[Tried], frozenset[str]]
     """Names of cameras that photos contradict (`unfit_cameras`)."""
     cut: Callable[[Tried], frozenset[str]]

@@ -69,7 +69,9 @@ def as_of_lenses(photos: Sequence[Photo], lenses: Mapping[int, int]) -> list[Pho
     out = list(photos)
     for i, lens in lenses.items():
         if lens:
-            out[i] = replace(photos[i], camera_key=f"{photos[i].camera_key} {NAMED} {lens + 1}")
+            name, zoom = f" {NAMED} {lens + 1}", photos[i].zoom
+            other = zoom and replace(zoom, camera=zoom.camera + name)
+            out[i] = replace(photos[i], camera_key=photos[i].camera_key + name, zoom=other)
     return out
 
 

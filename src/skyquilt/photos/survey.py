@@ -289,7 +289,10 @@ def _cameras(photos: Sequence[Photo]) -> Iterator[str]:
     keys = Counter(p.camera_key for p in photos)
     if len(keys) > 1:
         listed = sentence_of([f"{key} ({n})" for key, n in keys.items()])
-        yield f"There are {len(keys)} cameras: {listed}; each is calibrated separately."
+        yield (
+            f"There are {len(keys)} cameras: {listed}; each is calibrated separately, but for sizes"
+            " and zooms of one lens."
+        )
     bands = Counter(p.band for p in photos if not p.shows_a_band)  # those of a rig are told apart
     if len(bands) > 1:
         counts = " and ".join(f"{n} {band}" for band, n in sorted(bands.items()))

@@ -35,7 +35,7 @@ def write_jpeg(
     path: Path, pixels: NDArray[np.uint8], report: Report, body: Body, quality: int
 ) -> None:
     """Writes a photo (h, w, 3) with its metadata."""
-    exif = _exif(report, body, pixels.shape[1])
+    exif = _exif(report, body, max(pixels.shape[:2]))
     buffer = BytesIO()
     Image.fromarray(pixels).save(
         buffer, "JPEG", quality=quality, subsampling=2, exif=exif.tobytes()
@@ -60,7 +60,7 @@ def write_tiff(
     """Writes counts (h, w), thermal ones in hundredths of a kelvin, with their metadata; `what`
     they are, and `more` XMP.
     """
-    exif = _exif(report, body, counts.shape[1])
+    exif = _exif(report, body, max(counts.shape))
     exif[0x010E] = what
     tags = ImageFileDirectory_v2()
     for tag, value in exif.items():
@@ -74,7 +74,8 @@ def write_tiff(
     Image.fromarray(counts).save(path, "TIFF", tiffinfo=tags)  # uncompressed: libtiff drops EXIF
 
 
-def _exif(report: Report, body: Body, width: int) -> Image.Exif:
+def _exif(report: Report, body: Body, longer: int) -> Image.Exif:
+    """Tags of a picture whose longer side has this many px."""
     exif = Image.Exif()
     moment = body.start + timedelta(seconds=report.clock)
     exif[0x010F], exif[0x0110] = MAKE, body.model
@@ -92,7 +93,7 @@ def _exif(report: Report, body: Body, width: int) -> Image.Exif:
         ifd[0x920A] = _rational(millimetres, 10_000)
         ifd[0xA20E] = ifd[0xA20F] = _rational(10 / _PITCH_MM, 100)
         ifd[0xA210] = 3
-        ifd[0xA405] = round(millimetres * 36 / (width * _PITCH_MM))
+        ifd[0xA405] = round(millimetres * 36 / (longer * _PITCH_MM))
     if report.latitude is not None and report.longitude is not None:
         _gps(exif.get_ifd(_GPS_IFD), report.latitude, report.longitude, report.sea_level)
     return exif
