@@ -93,6 +93,17 @@ def test_no_delay_is_made_up(delay_s, headings):
     assert rig.delay_s == 0 and rig.agreeing == 10
 
 
+def test_the_delay_that_files_tell_is_taken_where_pictures_do_not_tell_it():
+    """A camera that turns with the lines: a rotation explains the delay over level ground, and lies
+    beside it over hills.
+    """
+    late = late_pairs(np.random.default_rng(8), 1.0, [0] * 10)
+    rig = FindRig(free=0, told_s=1.0)(late, B)
+    assert rig.delay_s == 1.0 and angle_deg(rig.b_R_a, TRUE) < 0.1
+    wrong = late_pairs(np.random.default_rng(7), 0.2, [0] * 6 + [180] * 6)
+    assert FindRig(free=0, told_s=1.0)(wrong, B).delay_s == pytest.approx(0.2, abs=0.02)
+
+
 @pytest.mark.slow
 def test_recorded_times_of_a_camera_with_a_clock_of_its_own_are_used_where_they_are_true():
     """Each pair is late by another time; the camera turns with the lines. Times that were drawn

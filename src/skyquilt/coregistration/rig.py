@@ -114,7 +114,9 @@ class FindRig:
     """A delay is taken if it lies that many standard deviations from none, by how much nearer to
     one rotation it brings the pairs.
     """
-    version: ClassVar[int] = 3
+    told_s: float = 0.0
+    """The delay of the second camera that its files tell, s; another one must clearly beat it."""
+    version: ClassVar[int] = 4
 
     def __call__(self, pairs: Sequence[RigPair], camera_b: Camera) -> Rig | RefusedRegistration:
         """The rig, or the reason why there is none."""
@@ -157,10 +159,10 @@ class FindRig:
         return looks, False
 
     def _delay(self, looks: Sequence[_Looks]) -> float:
-        """The delay in s at which the pairs' rotations lie nearest to a common one; 0 where none
-        brings them clearly nearer. Where angles r have the density exp(-r/s) / s^2 in the plane,
-        the logarithm of the likelihood is -2 n log(mean r), and rises by half the square of the
-        number of standard deviations.
+        """The delay in s at which the pairs' rotations lie nearest to a common one; `told_s` where
+        none brings them clearly nearer. Where angles r have the density exp(-r/s) / s^2 in the
+        plane, the logarithm of the likelihood is -2 n log(mean r), and rises by half the square of
+        the number of standard deviations.
         """
         if not any(p.pace.any() for p in looks):
             return 0.0
@@ -170,8 +172,8 @@ class FindRig:
         best = minimize_scalar(
             mean_deg, bounds=(near - step, near + step), method="bounded", options={"xatol": 1e-3}
         ).x
-        gain = 2 * len(looks) * np.log(mean_deg(0.0) / mean_deg(float(best)))
-        return float(best) if gain > self.sure**2 / 2 else 0.0
+        gain = 2 * len(looks) * np.log(mean_deg(self.told_s) / mean_deg(float(best)))
+        return float(best) if gain > self.sure**2 / 2 else self.told_s
 
     def _focal(self, pairs: Sequence[RigPair], camera_b: Camera) -> Camera:
         """The camera with the focal length that minimises the median misfit of directions over the

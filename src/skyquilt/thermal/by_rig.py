@@ -1,6 +1,5 @@
 """Thermal photos placed by the poses and the surface of visual photos taken by the same drone."""
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -37,10 +36,11 @@ from skyquilt.ortho.exposure import NEUTRAL, Exposure
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.radiometry import DriftMethod, balances_drift, drift_of, value_tags
 from skyquilt.photos.left_out import told_left_out, without_partner
-from skyquilt.photos.together import late_by, taken_together
+from skyquilt.photos.together import late_by
 from skyquilt.raster import CogWriter, RasterSpec
 from skyquilt.settings import PictureSettings
 from skyquilt.thermal.closed_shutter import closed_frames
+from skyquilt.thermal.partners import kind_of, of_one_camera, partners
 from skyquilt.thermal.rig_marks import drawn, marks_in
 from skyquilt.workflows.flow import Scene
 from skyquilt.workflows.photo_features import THUMBNAIL, pixels_again
@@ -59,10 +59,10 @@ _DOUBLED = (
     " thermal camera by itself"
 )
 """Why photos of a second thermal camera are not drawn."""
-_FEW = 0.2
-"""Share of the thermal photos up to which those of another camera or format are exceptions."""
-_ANOTHER = "it is of another camera or format than most of the thermal photos"
-"""Why they are not drawn."""
+_APART_PX = 4.0
+"""Median distance in thermal px of pairs from one rotation of the cameras, at most, where only the
+pattern of times says that one drone took both: another flight on the same lines is further off.
+"""
 _GRID = 6
 """Points per side of the grid from which the rotation of a registered pair is computed."""
 
@@ -103,14 +103,15 @@ class Rigged:
 def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistration:
     """Places thermal photos by visual poses, or gives the reason why this is not possible."""
     visual, placed = scene.aligned.photos, scene.aligned.alignment
-    beside, doubled = _beside(visual, thermal)
+    found = partners(visual, thermal)
+    beside, doubled = found.beside, found.doubled
     together = [(i, j) for j, i in sorted(beside.items()) if i in placed.poses]
     alone = [
         RejectedPhoto(name=p.name, reason=_DOUBLED) if p.name in doubled else p
         for p in without_partner(thermal, beside, placed.poses, "visual photo")
     ]
     bad = {j: r for _, j in together if (r := _undecodable(thermal[j])) is not None}
-    pairs, other = _of_one_camera(thermal, [(i, j) for i, j in together if j not in bad])
+    pairs, other = of_one_camera(thermal, [(i, j) for i, j in together if j not in bad])
     if len(pairs) < FindRig.minimum:
         return RefusedRegistration(
             reason=f"{len(pairs)} thermal photos were taken together with a visual one, by time or"
@@ -122,7 +123,7 @@ def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistrati
         )
     first = thermal[pairs[0][1]]
     frames = [thermal[j] for _, j in pairs]
-    kinds = set(map(_kind, frames))
+    kinds = set(map(kind_of, frames))
     if len(kinds) > 1:
         return RefusedRegistration(
             reason=f"the thermal photos are from {len(kinds)} cameras or formats"
@@ -136,7 +137,14 @@ def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistrati
         for i, j in asked
         if (p := _registered(scene, i, thermal[j], velocity[i])) is not None
     ]
-    rig = FindRig(free=_freedom(first))(seen, first.lens)
+    rig = FindRig(free=_freedom(first), told_s=found.delay_s)(seen, first.lens)
+    if found.by_pattern and isinstance(rig, Rig):
+        apart_px = np.radians(rig.spread_deg) * rig.camera_b.focal
+        if apart_px > _APART_PX:
+            return RefusedRegistration(
+                reason="the thermal photos were taken in the same pattern of times as the visual"
+                f" ones, but the cameras do not keep together: pairs are {apart_px:.0f} px apart"
+            )
     if not (isinstance(rig, Rig) and rig.timed):
         late = dict.fromkeys(late, 0.0)
     if isinstance(rig, Rig) or len(seen) < FindRig.minimum:  # else pairs contradict each other
@@ -177,48 +185,6 @@ def _open(found: Rigged, ground: Ground) -> Rigged:
     for k in sorted(shut):
         found = found.without(PhotoFailedError(found.photos[views[k].photo].name, CLOSED))
     return found
-
-
-def _beside(
-    visual: Sequence[Photo], thermal: Sequence[Photo]
-) -> tuple[dict[int, int], frozenset[str]]:
-    """Index of a thermal photo -> that of the visual one taken together with it, and the names of
-    those whose visual photo is beside one of another camera, of which there are more.
-    """
-    of_camera: dict[str, list[int]] = {}
-    for j, photo in enumerate(thermal):
-        of_camera.setdefault(photo.camera_key, []).append(j)
-    found = [
-        {own[k]: i for i, k in taken_together(visual, [thermal[j] for j in own])}
-        for own in of_camera.values()
-    ]
-    beside, doubled = dict[int, int](), set[str]()
-    for pairs in sorted(found, key=len, reverse=True):
-        taken = set(beside.values())
-        beside |= {j: i for j, i in pairs.items() if i not in taken}
-        doubled |= {thermal[j].name for j, i in pairs.items() if i in taken}
-    return beside, frozenset(doubled)
-
-
-def _of_one_camera(
-    thermal: Sequence[Photo], pairs: Sequence[tuple[int, int]]
-) -> tuple[list[tuple[int, int]], list[RejectedPhoto]]:
-    """The pairs (index of the visual photo, of the thermal one) without the few whose thermal photo
-    is of another camera or format than most, such as a reduced copy; all of them where these are
-    not few.
-    """
-    kinds = [_kind(thermal[j]) for _, j in pairs]
-    usual, n = Counter(kinds).most_common(1)[0] if kinds else (None, 0)
-    if len(kinds) - n > _FEW * len(kinds):
-        return list(pairs), []
-    kept = [pair for pair, kind in zip(pairs, kinds, strict=True) if kind == usual]
-    other = [thermal[j].name for (_, j), k in zip(pairs, kinds, strict=True) if k != usual]
-    return kept, [RejectedPhoto(name=name, reason=_ANOTHER) for name in other]
-
-
-def _kind(photo: Photo) -> tuple[str, int, str, str]:
-    """Camera and format: what the photos of one raster have in common."""
-    return photo.camera_key, photo.channels, photo.dtype, photo.unit
 
 
 def _with_lens(

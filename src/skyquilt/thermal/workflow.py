@@ -37,12 +37,12 @@ from skyquilt.ortho.radiometry import recorded_tags, value_figures
 from skyquilt.photos.guesses import as_thermal
 from skyquilt.photos.pixels import lost
 from skyquilt.photos.survey import survey_notes
-from skyquilt.photos.together import taken_together
 from skyquilt.settings import DEFAULTS, MosaicSettings, PictureSettings
 from skyquilt.thermal.by_heights import finer
 from skyquilt.thermal.by_pairs import by_homographies, by_pairs
 from skyquilt.thermal.by_rig import draw_rigged, drift_of_rigged, rig_figures, rig_notes, rigged
 from skyquilt.thermal.page import write_overlays, write_section
+from skyquilt.thermal.partners import partners
 from skyquilt.thermal.routes import ROUTES, Joined, as_registration, join, opened, refuse_apart
 from skyquilt.typed import as_path, instance
 from skyquilt.version import __version__
@@ -157,7 +157,7 @@ def _key(
     program.
     """
     maps = [run_key(given, wanted, methods_for(wanted)) for given, wanted in (visual, thermal)]
-    return digest(*maps, route, (FindRig(), FindBandRig(), join, rigged, draw_rigged), __version__)
+    return digest(*maps, route, (FindRig(), FindBandRig(), join, partners, rigged, draw_rigged), __version__)
 
 
 def _without_clips(heats: SurveyInput, folder: Path) -> tuple[SurveyInput, str]:
@@ -262,7 +262,7 @@ def _by_rig(
     """thermal.tif from the visual poses if one drone took both, or the reason why this is not
     possible. Frames that are lost meanwhile are left out.
     """
-    if not taken_together(visual.given.survey.photos, thermal.photos):
+    if not partners(visual.given.survey.photos, thermal.photos).beside:
         return RefusedRegistration(
             reason="no thermal photo was taken at the same time as a visual one, by time or name"
         )
