@@ -85,8 +85,8 @@ class _Matched:
     """(n,) 1 over their depth in m."""
     velocity: Array
     """(n, 3) of the map's camera along its own axes, m/s."""
-    late_s: Array
-    """(n,) `Together.late_s`."""
+    ahead: Array
+    """(n, 3) `Together.ahead`."""
     pair: NDArray[np.intp]
     """(n,) pair that each was matched in."""
     camera_a: Camera
@@ -94,7 +94,7 @@ class _Matched:
 
     def only(self, kept: NDArray[np.bool_]) -> "_Matched":
         """These (n,) of them."""
-        names = ("px_a", "px_b", "nearness", "velocity", "late_s", "pair")
+        names = ("px_a", "px_b", "nearness", "velocity", "ahead", "pair")
         return replace(self, **{n: getattr(self, n)[kept] for n in names})
 
 
@@ -142,7 +142,7 @@ class FindBandRig:
     off for these to count. Light lies beside materials by more on rougher ground: where brightness
     is all of one mind, as that of a single camera's bands is, it is not the light's.
     """
-    version: ClassVar[int] = 7
+    version: ClassVar[int] = 8
 
     def __call__(
         self,
@@ -282,14 +282,14 @@ class FindBandRig:
         for k, pair, b in pairs:
             small = there.reduced(b.shape)
             a = seen_by(pair, there, b.shape, coloured=coloured)
-            px, shift = _shifts(a, b, reach, apart)
+            px, shift = shifts(a, b, reach, apart)
             full = there.camera.height, there.camera.width
             px_b = full_px(px + shift, b.shape, full)
             px_a, near = there.in_photo(px, small, pair)
             velocity = np.broadcast_to(pair.velocity, (len(px_a), 3))
-            late = np.full(len(px_a), pair.late_s)
-            rows.append((px_a, px_b, near, velocity, late, np.full(len(px_a), k, np.intp)))
-        px_a, px_b, near, velocity, late, pair_ = (
+            ahead = np.broadcast_to(pair.ahead, (len(px_a), 3))
+            rows.append((px_a, px_b, near, velocity, ahead, np.full(len(px_a), k, np.intp)))
+        px_a, px_b, near, velocity, ahead, pair_ = (
             np.concatenate([row[n] for row in rows]) for n in range(6)
         )
         return _Matched(
@@ -297,7 +297,7 @@ class FindBandRig:
             px_b=px_b,
             nearness=near,
             velocity=velocity,
-            late_s=late,
+            ahead=ahead,
             pair=pair_,
             camera_a=pairs[0][1].camera_a,
         )
@@ -327,7 +327,7 @@ class FindBandRig:
 
         def misfit(x: Array) -> Array:
             # what is far off counts like what is three deviations off
-            px_b = camera(x).sees(ray_a, found.nearness, found.velocity, found.late_s)
+            px_b = camera(x).sees(ray_a, found.nearness, found.velocity, found.ahead)
             off = np.nan_to_num(px_b - found.px_b, nan=1e3) / sigma
             length = np.linalg.norm(off, axis=1, keepdims=True)
             weight = np.sqrt(np.log1p((length / 2) ** 2) / np.maximum((length / 2) ** 2, 1e-12))
@@ -379,7 +379,7 @@ def _scale(camera: Camera, side: int) -> float:
     return max(1.0, float(np.sqrt(camera.width * camera.height)) / side)
 
 
-def _shifts(a: Orientation, b: Orientation, reach: int, apart: float) -> tuple[Array, Array]:
+def shifts(a: Orientation, b: Orientation, reach: int, apart: float) -> tuple[Array, Array]:
     """Centres (n, 2) in px of patches that a and b (h, w) cover, from edge to edge, and the shift
     (n, 2) at which b's content lies where a has it; without those shifted by `reach`.
     """
@@ -406,5 +406,5 @@ def _shifts(a: Orientation, b: Orientation, reach: int, apart: float) -> tuple[A
 def _off(found: _Matched, there: Beside) -> Array:
     """(n,) distance in px of the band between places and where a camera has them."""
     ray_a = rays(found.camera_a, found.px_a)
-    px = there.sees(ray_a, found.nearness, found.velocity, found.late_s)
+    px = there.sees(ray_a, found.nearness, found.velocity, found.ahead)
     return np.asarray(np.linalg.norm(px - found.px_b, axis=1))

@@ -45,8 +45,10 @@ class Together:
     """
     velocity: Array = field(default_factory=lambda: np.zeros(3))
     """(3,) of the map's camera along its own axes, m/s; 0 where it is not known."""
-    late_s: float = 0.0
-    """How much later the photo of the band was taken than is usual, s."""
+    ahead: Array = field(default_factory=lambda: np.zeros(3))
+    """(3,) how much further than is usual the drone had flown when the photo of the band was taken,
+    m along the axes of the map's camera.
+    """
     colours: NDArray[np.uint8] | None = None
     """(H, W, 3) what `a` shows in colours; None where it has none, or they are not wanted."""
 
@@ -73,16 +75,16 @@ class Beside:
         """Its lens on a photo reduced to this shape."""
         return self.camera.reduced(shape[1], shape[0])
 
-    def sees(self, ray_a: Array, nearness: Array, velocity: Array, late_s: Array) -> Array:
+    def sees(self, ray_a: Array, nearness: Array, velocity: Array, ahead: Array) -> Array:
         """Its pixels (n, 2) of what lies on rays (n, 3) of the map's camera, at 1 over a depth;
-        `velocity` (n, 3) of the latter, `late_s` (n,): `Together.late_s`.
+        `velocity` (n, 3) of the latter, `ahead` (n, 3): `Together.ahead`.
         """
-        moved = self._moved(nearness, velocity, late_s)
+        moved = self._moved(nearness, velocity, ahead)
         return np.asarray(project(self.camera, (ray_a - moved) @ self.R.T))
 
-    def _moved(self, nearness: Array, velocity: Array, late_s: Array) -> Array:
+    def _moved(self, nearness: Array, velocity: Array, ahead: Array) -> Array:
         """(n, 3) by how much the rays to a place differ."""
-        place = np.array([*self.place, 0.0]) + (self.delay_s + late_s)[..., None] * velocity
+        place = np.array([*self.place, 0.0]) + self.delay_s * velocity + ahead
         return np.asarray(nearness[:, None] * place)
 
     def in_photo(self, px: Array, small: Camera, pair: Together) -> tuple[Array, Array]:
@@ -92,7 +94,7 @@ class Beside:
         ray = rays(small, px) @ self.R
         ray = ray / ray[:, 2:]
         near = _at(pair, project(pair.camera_a, ray))
-        moved = self._moved(near, pair.velocity, np.array(pair.late_s))
+        moved = self._moved(near, pair.velocity, pair.ahead)
         return np.asarray(project(pair.camera_a, ray + moved)), near
 
 

@@ -8,12 +8,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from skyquilt.alignment.motion import velocities_of
 from skyquilt.alignment.nothing_shown import CLOSED
 from skyquilt.coregistration.band_rig import FindBandRig
-from skyquilt.coregistration.beside import Beside
 from skyquilt.coregistration.pictures import guess_of, of_photo
 from skyquilt.coregistration.rig import FindRig, Rig, RigPair
 from skyquilt.coregistration.workflow import outcome_of
@@ -40,6 +38,7 @@ from skyquilt.photos.together import late_by
 from skyquilt.raster import CogWriter, RasterSpec
 from skyquilt.settings import PictureSettings
 from skyquilt.thermal.closed_shutter import closed_frames
+from skyquilt.thermal.each_ahead import beside_of, each_ahead
 from skyquilt.thermal.partners import kind_of, of_one_camera, partners
 from skyquilt.thermal.rig_marks import drawn, marks_in
 from skyquilt.workflows.flow import Scene
@@ -59,10 +58,6 @@ _DOUBLED = (
     " thermal camera by itself"
 )
 """Why photos of a second thermal camera are not drawn."""
-_APART_PX = 4.0
-"""Median distance in thermal px of pairs from one rotation of the cameras, at most, where only the
-pattern of times says that one drone took both: another flight on the same lines is further off.
-"""
 _GRID = 6
 """Points per side of the grid from which the rotation of a registered pair is computed."""
 
@@ -138,21 +133,26 @@ def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistrati
         if (p := _registered(scene, i, thermal[j], velocity[i])) is not None
     ]
     rig = FindRig(free=_freedom(first), told_s=found.delay_s)(seen, first.lens)
-    if found.by_pattern and isinstance(rig, Rig):
-        apart_px = np.radians(rig.spread_deg) * rig.camera_b.focal
-        if apart_px > _APART_PX:
-            return RefusedRegistration(
-                reason="the thermal photos were taken in the same pattern of times as the visual"
-                f" ones, but the cameras do not keep together: pairs are {apart_px:.0f} px apart"
-            )
     if not (isinstance(rig, Rig) and rig.timed):
         late = dict.fromkeys(late, 0.0)
+    ahead = {j: late[j] * (placed.poses[i].cam_R_map @ velocity[i]) for i, j in pairs}
+    if found.by_pattern and isinstance(rig, Rig):
+        ahead |= each_ahead(scene, asked, thermal, velocity, ahead, rig, rough=True)
     if isinstance(rig, Rig) or len(seen) < FindRig.minimum:  # else pairs contradict each other
-        rig = _with_lens(scene, thermal, pairs, velocity, late, rig)
+        rig = _with_lens(scene, thermal, pairs, velocity, ahead, rig)
     if isinstance(rig, RefusedRegistration):
         return rig
+    if found.by_pattern:
+        own = each_ahead(scene, pairs, thermal, velocity, ahead, rig)
+        if len(own) < _AGREE * len(pairs):
+            return RefusedRegistration(
+                reason=f"{len(own)} of {len(pairs)} thermal photos, released apart from the visual"
+                " ones, show what the thermal camera saw where the drone was by then"
+            )
+        ahead |= own
     poses = {
-        k: pose_beside(placed.poses[i], rig, velocity[i], late[j]) for k, (i, j) in enumerate(pairs)
+        k: pose_beside(placed.poses[i], rig, velocity[i], ahead[j])
+        for k, (i, j) in enumerate(pairs)
     }
     alignment = Alignment(
         method="rig",
@@ -192,21 +192,19 @@ def _with_lens(
     thermal: Sequence[Photo],
     pairs: Sequence[tuple[int, int]],
     velocity: Mapping[int, NDArray[np.float64]],
-    late: Mapping[int, float],
+    ahead: Mapping[int, NDArray[np.float64]],
     rig: Rig | RefusedRegistration,
 ) -> Rig | RefusedRegistration:
     """The rig with the lens of the thermal camera, from patches of pairs (index of the visual
-    photo, of the thermal one); `late`: by how many s the latter are; `rig`: what whole pictures
-    tell, which is kept where patches tell nothing. A strong lens keeps these from being registered
-    by a homography.
+    photo, of the thermal one); `ahead`: of the latter (`Together.ahead`); `rig`: what whole
+    pictures tell, which is kept where patches tell nothing. A strong lens keeps these from being
+    registered by a homography.
     """
-    first, near = thermal[pairs[0][1]], None
+    first = thermal[pairs[0][1]]
     seen = seen_together(
-        scene, far(scene, pairs), thermal, velocity, MOST_PAIRS, late_s=late, coloured=True
+        scene, far(scene, pairs), thermal, velocity, MOST_PAIRS, ahead=ahead, coloured=True
     )
-    if isinstance(rig, Rig):
-        turn = np.asarray(Rotation.from_matrix(rig.b_R_a).as_rotvec())
-        near = Beside(turn=turn, place=rig.a_t_b[:2], camera=rig.camera_b, delay_s=rig.delay_s)
+    near = beside_of(rig) if isinstance(rig, Rig) else None
     found = FindBandRig()(seen, first.lens, first.focal.sigma_px / first.focal.px, near)
     if isinstance(found, RefusedRegistration):
         return rig

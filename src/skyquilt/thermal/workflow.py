@@ -157,7 +157,9 @@ def _key(
     program.
     """
     maps = [run_key(given, wanted, methods_for(wanted)) for given, wanted in (visual, thermal)]
-    return digest(*maps, route, (FindRig(), FindBandRig(), join, partners, rigged, draw_rigged), __version__)
+    return digest(
+        *maps, route, (FindRig(), FindBandRig(), join, partners, rigged, draw_rigged), __version__
+    )
 
 
 def _without_clips(heats: SurveyInput, folder: Path) -> tuple[SurveyInput, str]:

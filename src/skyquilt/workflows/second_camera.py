@@ -23,6 +23,8 @@ from skyquilt.workflows.photo_features import pixels_again
 
 LONGEST = 1600
 """Longest side in px of the pictures that are compared."""
+_NOWHERE = np.zeros(3)
+"""(3,) m that a camera is ahead of where its rig has it, where nothing tells."""
 _FAR = 0.6
 """Share of the usual height above the ground from which a capture can tell the camera."""
 _PLACES = 65
@@ -42,12 +44,15 @@ def far(scene: Scene, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, int]]
 
 
 def pose_beside(
-    pose: Pose, rig: Rig | BandRig, velocity: NDArray[np.float64], late_s: float = 0.0
+    pose: Pose,
+    rig: Rig | BandRig,
+    velocity: NDArray[np.float64],
+    ahead: NDArray[np.float64] = _NOWHERE,
 ) -> Pose:
-    """The pose of the second camera, exposed so much later than when the rig has it, when the map's
-    photo had this one; `velocity` (3,) of the latter, m/s in the map frame.
+    """The pose of the second camera when the map's photo had this one; `velocity` (3,) of the
+    latter, m/s in the map frame; `ahead`: `Together.ahead`.
     """
-    moved = rig.a_t_b @ pose.cam_R_map + (rig.delay_s + late_s) * velocity
+    moved = (rig.a_t_b + ahead) @ pose.cam_R_map + rig.delay_s * velocity
     return Pose(cam_R_map=rig.b_R_a @ pose.cam_R_map, map_C=pose.map_C + moved)
 
 
@@ -58,17 +63,17 @@ def seen_together(
     velocities: Mapping[int, NDArray[np.float64]],
     most: int,
     *,
-    late_s: Mapping[int, float] = MappingProxyType({}),
+    ahead: Mapping[int, NDArray[np.float64]] = MappingProxyType({}),
     coloured: bool = False,
 ) -> list[Together]:
     """Pictures of at most so many pairs, spread evenly over the flight, without those whose file
     cannot be read. A pair: indices of the map's photo and of one of `photos`; `velocities` (3,) of
-    the former, m/s in the map frame; `late_s`: how much later than usual the latter is exposed, by
-    its index. `coloured`: with the colours of the map's photos.
+    the former, m/s in the map frame; `ahead`: `Together.ahead`, by the index of the
+    latter. `coloured`: with the colours of the map's photos.
     """
     asked = [pairs[k] for k in evenly(len(pairs), most)]
     found = (
-        replace(pictures, late_s=late_s.get(j, 0.0))
+        replace(pictures, ahead=ahead.get(j, _NOWHERE))
         for i, j in asked
         if (pictures := _together(scene, i, photos[j], velocities[i], coloured)) is not None
     )
