@@ -84,6 +84,7 @@ def test_a_constant_delay_and_a_clock_that_is_off_tell_the_pairs(
     a, b, true = flown(delay_s, clock_s, scatter_s, noise_m, lost=(4, 20))
     found = partners(a, b)
     assert found.beside == true and found.by_pattern
+    assert found.apart_s == pytest.approx(delay_s + clock_s, abs=0.1)
     assert found.delay_s == pytest.approx(delay_s, abs=0.15)
 
 

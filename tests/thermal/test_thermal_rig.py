@@ -19,7 +19,8 @@ from skyquilt.model.camera import Camera
 from skyquilt.model.event import Note, Result
 from skyquilt.ortho.exposure import NEUTRAL
 from skyquilt.settings import MosaicSettings
-from skyquilt.thermal import workflow
+from skyquilt.thermal import by_rig, workflow
+from skyquilt.thermal.partners import partners
 from skyquilt.thermal.workflow import iter_thermal
 
 HEAT = replace(Camera.ideal(width=320, height=256, focal=400.0), k1=-0.2)
@@ -152,3 +153,21 @@ def test_a_frame_that_is_lost_before_it_is_drawn_is_left_out(
     assert f"{gone.name} is left out: its file is gone" in [
         event.text for event in before if isinstance(event, Note)
     ]
+
+
+@pytest.mark.slow
+def test_frames_that_only_the_pattern_of_times_pairs_tell_where_they_were_taken(
+    flight, frames, output, monkeypatch
+):
+    """They were taken at once in truth, so the rig is the same."""
+
+    def by_pattern(*both):
+        return replace(partners(*both), by_pattern=True, apart_s=3600.0)
+
+    monkeypatch.setattr(by_rig, "partners", by_pattern)
+    *before, last = iter_thermal(flight / "photos", frames, output, SETTINGS, overwrite=True)
+    told = last.metrics["thermal"]
+    assert told["route"] == "rig" and told["photos_used"] == 9
+    assert angle_deg(np.array(told["thermal_R_visual"]), TURN) < 0.1
+    said = [n.text for n in before if isinstance(n, Note)]
+    assert any("3600.0 s before them" in text and "9 of 9" in text for text in said)

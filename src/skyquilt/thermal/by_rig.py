@@ -51,6 +51,11 @@ KNOWN_FOCAL = 0.01
 """The thermal focal length is not estimated if its relative standard deviation is below this."""
 _AGREE = 0.75
 """Share of registered pairs below which it is told that others do not agree with them."""
+_BY_PATTERN = (
+    "thermal photos are paired with the visual ones that say they were taken {s:.1f} s before them,"
+    " by the pattern of their times; {n} of {of} are drawn from where their own pictures show that"
+    " the drone was by then"
+)
 _TOLD_S = 0.05
 """Delay of the thermal camera that is told, s."""
 _DOUBLED = (
@@ -135,6 +140,7 @@ def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistrati
     rig = FindRig(free=_freedom(first), told_s=found.delay_s)(seen, first.lens)
     if not (isinstance(rig, Rig) and rig.timed):
         late = dict.fromkeys(late, 0.0)
+    said = ""
     ahead = {j: late[j] * (placed.poses[i].cam_R_map @ velocity[i]) for i, j in pairs}
     if found.by_pattern and isinstance(rig, Rig):
         ahead |= each_ahead(scene, asked, thermal, velocity, ahead, rig, rough=True)
@@ -150,6 +156,7 @@ def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistrati
                 " ones, show what the thermal camera saw where the drone was by then"
             )
         ahead |= own
+        said = _BY_PATTERN.format(s=found.apart_s, n=len(own), of=len(pairs))
     poses = {
         k: pose_beside(placed.poses[i], rig, velocity[i], ahead[j])
         for k, (i, j) in enumerate(pairs)
@@ -166,7 +173,8 @@ def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistrati
     )
     photos = tuple(thermal[j] for _, j in pairs)
     left = (*bad.values(), *other, *alone)
-    return _open(Rigged(rig=rig, photos=photos, alignment=alignment, rejected=left), scene.ground)
+    result = Rigged(rig=rig, photos=photos, alignment=alignment, rejected=left)
+    return _open(replace(result, notes=(said,) if said else ()), scene.ground)
 
 
 def _open(found: Rigged, ground: Ground) -> Rigged:
@@ -177,7 +185,7 @@ def _open(found: Rigged, ground: Ground) -> Rigged:
     except PhotoFailedError:  # told when it is drawn
         return found
     marks, said = marks_in(found.photos, views, frames, ground)
-    found = replace(found, marks=marks, notes=said)
+    found = replace(found, marks=marks, notes=(*found.notes, *said))
     samples = ground_samples(views, frames, ground.surface, ground.grid.bounds, Drift.points)
     shut = closed_frames(samples)
     if len(views) - len(shut) < FindRig.minimum:

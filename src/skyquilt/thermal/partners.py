@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +51,8 @@ class Partners:
     """Whether only the pattern of their times tells the pairs."""
     delay_s: float = 0.0
     """How much later the thermal photos were taken, by positions; 0 where these tell nothing."""
+    apart_s: float = 0.0
+    """How much later they say that they were taken, where only the pattern tells."""
 
 
 def partners(visual: Sequence[Photo], thermal: Sequence[Photo]) -> Partners:
@@ -67,17 +69,15 @@ def partners(visual: Sequence[Photo], thermal: Sequence[Photo]) -> Partners:
         if delayed is None or len(delayed.beside) <= _MORE * len(pairs):
             delayed = Partners(beside={k: i for i, k in pairs})
         named = {own[k]: i for k, i in delayed.beside.items()}
-        found.append((named, delayed.by_pattern, delayed.delay_s))
-    found.sort(key=lambda one: len(one[0]), reverse=True)
+        found.append(replace(delayed, beside=named))
+    found.sort(key=lambda one: len(one.beside), reverse=True)
     beside, doubled = dict[int, int](), set[str]()
-    for pairs_, _, _ in found:
+    for one in found:
         taken = set(beside.values())
-        beside |= {j: i for j, i in pairs_.items() if i not in taken}
-        doubled |= {thermal[j].name for j, i in pairs_.items() if i in taken}
-    _, by_pattern, delay_s = found[0] if found else ({}, False, 0.0)
-    return Partners(
-        beside=beside, doubled=frozenset(doubled), by_pattern=by_pattern, delay_s=delay_s
-    )
+        beside |= {j: i for j, i in one.beside.items() if i not in taken}
+        doubled |= {thermal[j].name for j, i in one.beside.items() if i in taken}
+    most = found[0] if found else Partners(beside={})
+    return replace(most, beside=beside, doubled=frozenset(doubled))
 
 
 def released_later(a: Sequence[Photo], b: Sequence[Photo]) -> Partners | None:
@@ -121,6 +121,7 @@ def released_later(a: Sequence[Photo], b: Sequence[Photo]) -> Partners | None:
         beside={int(of_b[j]): int(of_a[i]) for i, j in pairs},
         by_pattern=True,
         delay_s=0.0 if places is None else delay_s,
+        apart_s=float(np.median(times_b[pairs[:, 1]] - times_a[pairs[:, 0]])),
     )
 
 
