@@ -263,10 +263,13 @@ class _Parts:
         self._added = 0
 
     def add(self, L: Array, M: Array) -> None:
-        """Keeps those of the next front."""
+        """Keeps those of the next front, laid out as they are read from a file: products of other
+        layouts differ in their last bits.
+        """
+        L, M = np.asfortranarray(L), np.ascontiguousarray(M)
         if self._file is not None:
             try:
-                self._file.writelines(np.ascontiguousarray(part).data for part in (L.T, M))
+                self._file.writelines(part.data for part in (L.T, M))
                 self._file.flush()
             except OSError:  # a full disk
                 self._held, self._file = [self._copied(k) for k in range(self._added)], None
