@@ -53,6 +53,8 @@ def test_a_second_place_is_told_as_such_where_no_photo_has_metadata():
     assert set(found.poses) == set(range(10))
     assert found.rejected.keys() == set(range(10, 14))
     assert all("not with the 10 of the largest block" in w for w in found.rejected.values())
+    # photos that are hung on others later look for the blocks of all that show a tie point
+    assert set(found.ties.photo.tolist()) == set(range(10))
 
 
 def test_one_photo_without_links_places_no_block():

@@ -9,7 +9,7 @@ import numpy as np
 from skyquilt.alignment.adjust import covariance, with_common_tilts
 from skyquilt.alignment.contradicted_control import control_notes
 from skyquilt.alignment.control import Control, hold_to_control, residuals_of_control
-from skyquilt.alignment.determined import STATED_DEG, weak_photos
+from skyquilt.alignment.determined import STATED_DEG, weak_photos, without
 from skyquilt.alignment.dominant_plane import levelled
 from skyquilt.alignment.enlarged import as_enlarged
 from skyquilt.alignment.equations import NearFactor
@@ -374,6 +374,7 @@ def _outcome(
     weak = {int(i): f"it has only {seen[i]} tie points" for i in setup.members if seen[i] < 8}
     if all(c.check for c in control):
         weak |= _nowhere(start)
+    ties = without(ties, weak) if weak else ties
     alone = covariance(problem, state)
     alike = alike_off(problem, state, setup.block_rows)
     full = alone and with_common_tilts(alone, problem, state, alike)
