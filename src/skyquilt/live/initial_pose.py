@@ -100,7 +100,7 @@ class InitialPose:
         self.queues.received.popleft()
         self.queues.untried.append(member)
         if pose is not None:
-            few = len(self.queues.received) + len(self.queues.untried) <= AT_ONCE
+            few = len(self.queues.received) + self.queues.unrefined <= AT_ONCE
             if few and known is None and self.metadata.loose(member, pose):
                 self.redraw.held.add(member.id)
             else:

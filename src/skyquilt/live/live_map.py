@@ -354,9 +354,8 @@ class LiveMap:
                 self.background.stop()
                 self._reload()
             return update
-        if not self.queues.untried:
+        if (member := self.queues.next_untried()) is None:
             return None
-        member = self.queues.untried[0]
         with concerning(member.id):
             if member.state != "superseded" and not self.live_links.has_features(member.id):
                 self.live_links.features(member.id)

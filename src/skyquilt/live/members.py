@@ -86,10 +86,22 @@ class Queues:
         """To be placed by their metadata, in order of acceptance."""
         untried = [m for m in known if m.state in ("placed", "waiting") and not m.tried]
         self.untried = deque(sorted(untried, key=lambda m: (m.again, m.id)))
-        """To be compared with their neighbours."""
+        """To be compared with their neighbours; refined ones once more."""
         lost = [m for m in known if m.state == "waiting" and m.tried]
         self.lost = sorted(lost, key=lambda m: m.tried)
         """Compared, but still without a pose."""
+
+    @property
+    def unrefined(self) -> int:
+        """Number of photos in `untried` that are not refined yet."""
+        return sum(m.state != "refined" for m in self.untried)
+
+    def next_untried(self) -> Member | None:
+        """The photo to compare next: one that is not refined yet before those that are to be once
+        more, which already lie as the photos around them do.
+        """
+        first = next((m for m in self.untried if m.state != "refined"), None)
+        return first or (self.untried[0] if self.untried else None)
 
 
 class Members:

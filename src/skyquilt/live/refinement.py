@@ -64,9 +64,9 @@ class Refinement:
         self._tried = max((m.tried for m in self.members.by_id.values()), default=0)
 
     def refine(self, member: Member) -> Update:
-        """Refines the photo, which is the first in the queue of photos not compared yet."""
+        """Refines the photo, which is in the queue of photos to be compared."""
         if member.state == "superseded":
-            self.queues.untried.popleft()
+            self.queues.untried.remove(member)
             return Update(what="noted", photo=member.id)
         change = self.local_pose.refine(member, self._rejoining.pop(member.id, {}))
         found = self._found(member, change)
@@ -75,7 +75,7 @@ class Refinement:
             self.redraw.show(member)
         elif turned:
             self.redraw.moved(member)
-        self.queues.untried.popleft()
+        self.queues.untried.remove(member)
         self._requeue(member, found)
         alone = "waiting" if self.members.frame is None else "loose"
         return Update(
