@@ -10,7 +10,7 @@ from skyquilt.alignment.adjust import covariance, with_common_tilts
 from skyquilt.alignment.contradicted_control import control_notes
 from skyquilt.alignment.control import Control, hold_to_control, residuals_of_control
 from skyquilt.alignment.determined import STATED_DEG, weak_photos, without
-from skyquilt.alignment.dominant_plane import levelled
+from skyquilt.alignment.dominant_plane import level_untold, levelled
 from skyquilt.alignment.enlarged import as_enlarged
 from skyquilt.alignment.equations import NearFactor
 from skyquilt.alignment.false_tilts import alike_off
@@ -175,7 +175,7 @@ class Bundle:
             weak = weak_photos(found, begun.priors)
         own = taken(begun)
         done = hung(found, weak, own, begun.priors, features, links, begun.aside)
-        done = told_besides(done, priors, ground_of(frame))
+        done = told_besides(level_untold(done, priors), priors, ground_of(frame))
         notes += control_notes(done, photos, priors) if control else ()
         return replace(done, notes=(*done.notes, *notes)) if notes else done
 

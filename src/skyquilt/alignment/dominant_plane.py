@@ -1,12 +1,17 @@
-"""The level of a map of photos that report neither positions nor angles: from the plane that most
+"""The level of a map of photos that report neither heights nor angles: from the plane that most
 tie points lie near, the vertical that most photos look along, and the height they are flown at.
 """
+
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.oblique import tilts_reported
+from skyquilt.alignment.similarity_graph import fit_similarity
 from skyquilt.geometry.frames import turning
-from skyquilt.model.poses import Alignment
+from skyquilt.model.poses import Alignment, Prior
 
 Array = NDArray[np.float64]
 NEAR = 0.03
@@ -35,6 +40,30 @@ GROUND_DEG, AXES_DEG, FLOWN_DEG = 3.0, 1.5, 1.5
 """How far ground that counts as level slopes, gimbals are off, and drones climb that fly at one
 height: one standard deviation each. `brighton` without metadata: 4.1, 0.0 and 0.8 degrees.
 """
+FEWEST_FLOWN, LEAST_WAY, STRAIGHT = 4, 0.5, 0.05
+"""Fewest photos that tell how a flight rises along a direction; how far they lie apart along it at
+least, in flying heights; and how far off a straight rise they lie at most (RMS), as a share of
+that.
+"""
+RISES_DEG = 5.0
+"""Ground and flight rise alike where both rise by more, and differ by less. Over a hillside, a drone
+that keeps its height does not rise."""
+UNTOLD = (
+    "No file tells heights or camera angles, and photos are headed alike: nothing tells how the map"
+    " is tilted along the flight."
+)
+"""How the sentence begins that says so."""
+TAKEN_LEVEL = (
+    UNTOLD
+    + " If cameras looked straight down, both the ground and the flight would rise by {0:.0f}"
+    " degrees: both are taken to be level, and cameras to look aside. Heights, camera angles or"
+    " control points would tell."
+)
+TAKEN_DOWN = (
+    UNTOLD
+    + " Cameras are taken to look straight down; where they looked some degrees aside, the map"
+    " rises or falls by as much. Heights, camera angles or control points would tell."
+)
 
 
 def dominant_normal(xyz: Array, near_m: float) -> Array:
@@ -91,6 +120,74 @@ def levelled(alignment: Alignment) -> Alignment:
     if np.linalg.norm(side) < 1e-9:
         return alignment
     return alignment.carried(Q, 1.0, np.median(xyz, axis=0))
+
+
+def level_untold(alignment: Alignment, priors: Sequence[Prior]) -> Alignment:
+    """The alignment of photos with positions of which no file tells heights or angles, with a note
+    where nothing else tells how it is tilted: all are headed alike, and look not square to where
+    they fly. Turned so that ground and flight are level, and laid on the positions anew, where both
+    would rise alike by more than `RISES_DEG`: a camera that looks ahead does that, a hillside does
+    not, unless the drone follows it. Others are unchanged.
+    """
+    held = [i for i in alignment.held if np.isfinite(priors[i].map_C[:2]).all()]
+    told = alignment.control or tilts_reported(priors) or len(alignment.ties.xyz) < 3
+    if told or len(held) < FEWEST_FLOWN or np.isfinite([p.map_C[2] for p in priors]).any():
+        return alignment
+    C = np.array([alignment.poses[i].map_C for i in held])
+    R = np.array([alignment.poses[i].cam_R_map for i in held])
+    if vertical_of(R, C) is not None:
+        return alignment
+    rise, square = _common_rise(C, alignment.ties.xyz)
+    if not rise.any():
+        return alignment if square else replace(alignment, notes=(*alignment.notes, TAKEN_DOWN))
+    up = np.array([0.0, 0.0, 1.0])
+    normal = np.array([*-rise, 1.0])
+    normal /= np.linalg.norm(normal)
+    side = np.cross(normal, up)
+    Q = turning(np.array([normal, side, np.cross(normal, side)]), _frame(up, side))
+    done = alignment.carried(Q, 1.0, np.median(alignment.ties.xyz, axis=0))
+    done = _on_positions(done, held, priors)
+    note = TAKEN_LEVEL.format(np.degrees(np.arctan(np.linalg.norm(rise))))
+    return replace(done, notes=(*done.notes, note))
+
+
+def _common_rise(C: Array, xyz: Array) -> tuple[Array, bool]:
+    """(2,) the slope along x and y by which both centres (n, 3) and most of the points (P, 3) rise,
+    as the mean by their deviations; along each main direction of the flight that is long enough to
+    tell, zero where they do not rise alike. And whether the flight rises by `UPRIGHT_DEG` at most.
+    """
+    high = _height(C, xyz)
+    normal = dominant_normal(xyz, NEAR * high)
+    ground = -normal[:2] / normal[2]
+    off = C - C.mean(0)
+    _, _, directions = np.linalg.svd(off[:, :2], full_matrices=False)
+    way = off[:, :2] @ directions.T
+    long = np.ptp(way, axis=0) > LEAST_WAY * high
+    flown = np.linalg.lstsq(way[:, long], off[:, 2], rcond=None)[0]
+    rest = off[:, 2] - way[:, long] @ flown
+    rise = np.zeros(2)
+    if not long.any() or np.sqrt((rest**2).mean()) > STRAIGHT * np.ptp(way, axis=0).max():
+        return rise, False
+    for along, flight in zip(directions[long], flown, strict=True):
+        degrees = np.degrees(np.arctan([flight, along @ ground]))
+        if np.abs(degrees).min() > RISES_DEG and abs(np.diff(degrees)[0]) < RISES_DEG:
+            mean = np.average(degrees, weights=[FLOWN_DEG**-2, GROUND_DEG**-2])
+            rise += np.tan(np.radians(mean)) * along
+    return rise, bool(np.degrees(np.arctan(np.abs(flown))).max() <= UPRIGHT_DEG)
+
+
+def _on_positions(found: Alignment, held: Sequence[int], priors: Sequence[Prior]) -> Alignment:
+    """The alignment enlarged, turned about the vertical and moved sideways so that photos lie where
+    they report to be.
+    """
+    x = np.array([found.poses[i].map_C[:2] for i in held]) @ (1, 1j)
+    y = np.array([priors[i].map_C[:2] for i in held]) @ (1, 1j)
+    g, c, _ = fit_similarity(x, y, np.array([priors[i].sigma_C[0] for i in held]))
+    cos, sin = g.real / abs(g), g.imag / abs(g)
+    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    middle = np.median(found.ties.xyz, axis=0)
+    there = g * complex(middle[0], middle[1]) + c
+    return found.carried(turn, abs(g), middle, np.array([there.real, there.imag, middle[2]]))
 
 
 def vertical_of(cam_R_map: Array, map_C: Array) -> tuple[Array, float] | None:
