@@ -239,3 +239,29 @@ def test_the_folder_of_photos_itself_is_no_survey(tmp_path):
     for folder in (found.out, tmp_path / "link", found.out / ".." / "out"):
         with pytest.raises(UsageError, match="is the folder of the photos"):
             Watch(folder=folder, intake=found.intake)
+
+
+def test_a_file_that_is_removed_before_it_was_read_is_told(tmp_path, flight):
+    found = Watched(tmp_path)
+    if not found.watch._closed.told:
+        pytest.skip("this system does not tell of files that are complete")
+    data = flight.photos[0].read_bytes()
+    path = found.folder / "drone-1" / "a.jpg"
+    path.parent.mkdir()
+    found.look(0.02)
+    for part in (data, data[:9000]):
+        path.write_bytes(part)
+        path.unlink()
+        done = found.look(0.1)
+        assert [(type(d), d.name, d.reason) for d in done] == [(Refused, "a.jpg", watching.REMOVED)]
+    path.write_bytes(data)
+    assert [type(d) for d in found.look(0.1)] == [Accepted]
+    path.unlink()  # read by now
+    assert found.look(0.1) == [] and found.ledger.rows("select name from refused") == []
+    path.write_bytes(data)
+    path.rename(path.with_name("b.jpg"))  # still there
+    path.with_name("b.jpg").rename(path.with_name("c.jpg"))
+    assert all(isinstance(d, Accepted) for d in found.look(0.1))
+    path.with_name("notes.txt").write_text("no photo", "utf-8")
+    path.with_name("notes.txt").unlink()
+    assert found.look(0.1) == []

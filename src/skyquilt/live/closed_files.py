@@ -12,7 +12,8 @@ from typing import Any
 
 from skyquilt.outside import is_folder, walk
 
-CLOSE_WRITE, MOVED_TO, CREATE, IS_DIR, OVERFLOW = 0x8, 0x80, 0x100, 0x40000000, 0x4000
+CLOSE_WRITE, MOVED_TO, CREATE, DELETE = 0x8, 0x80, 0x100, 0x200
+IS_DIR, OVERFLOW = 0x40000000, 0x4000
 IGNORED, MOVE_SELF = 0x8000, 0x800
 _HEAD = struct.Struct("iIII")
 
@@ -25,6 +26,8 @@ class ClosedFiles:
     """The folder that is watched."""
     told: bool = False
     """Whether this system reports closed files."""
+    removed: set[str] = field(default_factory=set)
+    """Paths of files that were deleted between the last two calls of `look`."""
     _libc: Any = None
     _handle: int = -1
     _lost: bool = False
@@ -47,7 +50,7 @@ class ClosedFiles:
         every = True
         for here, _, _ in walk(Path(folder)):
             number = self._libc.inotify_add_watch(
-                self._handle, os.fsencode(here), CLOSE_WRITE | MOVED_TO | CREATE | MOVE_SELF
+                self._handle, os.fsencode(here), CLOSE_WRITE | MOVED_TO | CREATE | DELETE | MOVE_SELF
             )
             every &= number >= 0
             if number < 0:
@@ -62,6 +65,7 @@ class ClosedFiles:
         watched, and after the queue of events overflowed.
         """
         closed: set[str] = set()
+        self.removed = set()
         everything = False
         if self._lost and is_folder(self.folder):
             self._lost, everything = not self._watch(str(self.folder)), True
@@ -79,6 +83,8 @@ class ClosedFiles:
                     self._lost = True  # the folder was removed, or its disk
                 if mask & IS_DIR:
                     self.told &= self._watch(path) or not is_folder(Path(path))
+                if mask & DELETE and not mask & IS_DIR:
+                    self.removed.add(path)
                 everything |= bool(mask & (IS_DIR | OVERFLOW))
                 if mask & (CLOSE_WRITE | MOVED_TO) and not mask & IS_DIR:
                     closed.add(path)

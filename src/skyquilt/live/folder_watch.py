@@ -39,6 +39,7 @@ it changes.
 """
 CARD, ON_CARD = "DCIM", re.compile(r"[1-9]\d\d\w{5}")
 """The folder of a camera's card, and the folders in it."""
+REMOVED = "it was removed before it was read; copy it again"
 Stamp = tuple[int, int]
 """Size and modification time of a file."""
 
@@ -94,6 +95,8 @@ class Watch:
     growing: dict[str, Growing] = field(default_factory=dict)
     """Files that are not taken yet, by path."""
     _clips: dict[str, tuple[Stamp, Taking]] = field(default_factory=dict)
+    _vanished: set[str] = field(default_factory=set)
+    """Paths of files that were closed after writing and are gone: removed, or renamed."""
     _closed_folders: dict[Path, str] = field(default_factory=dict)
     _due: float = 0.0
 
@@ -121,6 +124,10 @@ class Watch:
         for path in sorted(self._closed_folders.keys() - told):
             reason = f"this folder cannot be read ({self._closed_folders[path]})"
             yield self.intake.refuse(path.name, self.folder.name, reason)
+        for key in sorted(self._vanished & self._closed.removed, key=Path):
+            self._vanished.discard(key)
+            source = drone_of(Path(key).parent, self.folder)
+            yield self.intake.refuse(Path(key).name, source, REMOVED)
         for key in sorted(self.growing, key=Path):
             known = self.growing[key]
             if not known.closed and now - known.since < QUIET_S:
@@ -135,6 +142,7 @@ class Watch:
             except FileNotFoundError:  # removed since it was seen
                 self.growing.pop(key, None)
                 self._clips.pop(key, None)
+                self._vanished.add(key)
 
     def _note(self, now: float) -> None:
         """Records files that are new or have grown, and files that were closed after writing."""
@@ -143,7 +151,10 @@ class Watch:
             key = str(path)
             if stamp is None or self._seen.get(_stored(key)) == stamp:
                 self.growing.pop(key, None)
+                if stamp is None and key in closed and _stored(key) not in self._seen:
+                    self._vanished.add(key)
                 continue
+            self._vanished.discard(key)
             known = self.growing.get(key)
             if known is None or known.stamp != stamp:
                 known = self.growing[key] = Growing(stamp=stamp, since=now)
