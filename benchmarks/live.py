@@ -253,6 +253,9 @@ def tone(survey: Path, gsd: float) -> None:
             gains={k: settled.gains[m.id] for k, m in enumerate(members)},
             fields={k: settled.fields[m.id] for k, m in enumerate(members)},
             offsets={},
+            shades={
+                k: settled.shades[m.id] for k, m in enumerate(members) if m.id in settled.shades
+            },
         )
         place = ground.views, small, ground.surface, ground.grid.bounds
         of_live, of_none = (tone_residual(*place, e) for e in (exposure, NEUTRAL))

@@ -46,8 +46,9 @@ least, in flying heights; and how far off a straight rise they lie at most (RMS)
 that.
 """
 RISES_DEG = 5.0
-"""Ground and flight rise alike where both rise by more, and differ by less. Over a hillside, a drone
-that keeps its height does not rise."""
+"""Ground and flight rise alike where both rise by more, and differ by less. Over a hillside, a
+drone that keeps its height does not rise.
+"""
 UNTOLD = (
     "No file tells heights or camera angles, and photos are headed alike: nothing tells how the map"
     " is tilted along the flight."

@@ -69,6 +69,8 @@ class ApplyAdjustment:
             if len(done.ids) >= FEWEST_TOLD:
                 self.ledger.tell_new(done.notes, TOLD, VALUES)
         hit("block closed")
+        for i in self.redraw.canvas.level(done.exposure) if done.exposure.gains else ():
+            self.redraw.altered(self.members.by_id[i])
         if done.cameras:  # heights and calibrations changed: redraw the whole block
             self._show(done)
         return Update(what="closed", moved=tuple(done.poses), text=text)

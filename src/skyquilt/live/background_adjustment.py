@@ -28,7 +28,9 @@ from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, MapFrame, Pose, Prior
 from skyquilt.model.surface import Surface
-from skyquilt.ortho.ground import find_ground
+from skyquilt.ortho.exposure import NEUTRAL, Exposure
+from skyquilt.ortho.ground import Ground, find_ground
+from skyquilt.ortho.radiometry import Levelling
 from skyquilt.photos.pixels import read_color
 from skyquilt.settings import PictureSettings
 from skyquilt.workflows.methods import Methods
@@ -78,7 +80,9 @@ class AdjustmentJob:
     in a third of the time, as photos arrive, and it is soon adjusted again.
     """
     sweep: bool
-    """Whether ground heights are also computed from the images, as in the batch workflow."""
+    """Whether ground heights are also computed from the images, and shadows of clouds are looked
+    for, as in the batch workflow.
+    """
     most_view_deg: float = 90.0
     """Angle from the nadir up to which photos are drawn."""
 
@@ -101,6 +105,10 @@ class BlockAdjustment:
     """Photos that could not be held, with reasons."""
     notes: tuple[str, ...] = ()
     """What users of a map of these photos must know; empty if it was not adjusted thoroughly."""
+    exposure: Exposure = NEUTRAL
+    """Brightness of photos that show shadows of clouds, and of those around them, by number;
+    neutral where there are none, or none were looked for.
+    """
     before: dict[int, Pose] = field(default_factory=dict)
     """Poses when the job began."""
     problem: str = ""
@@ -117,7 +125,7 @@ def adjust_block(job: AdjustmentJob) -> BlockAdjustment:
             ledger.close()
         registry = {c.__name__: c for c in (PhotoFeatures, Features, Surface)}
         store = Store(folder=job.store, registry=registry, within=job.folder)
-        features = [_features(p, store, job.methods) for p in job.photos]
+        features = [_look(p, store, job.methods).features for p in job.photos]
         done = _part(job, links, features) if job.held else _whole(job, links, features, store)
         return replace(done, before=job.poses)
     except (AlignmentError, SkyquiltError, np.linalg.LinAlgError, ValueError) as error:
@@ -130,11 +138,11 @@ def _nothing(ids: tuple[int, ...], problem: str) -> BlockAdjustment:
     )
 
 
-def _features(photo: Photo, store: Store, methods: Methods) -> Features:
+def _look(photo: Photo, store: Store, methods: Methods) -> PhotoFeatures:
     looked = store.get("features", features_key(photo, methods.detector))
     if looked is None:
         raise AlignmentError(f"the features of {photo.name} are missing from the store")
-    found: Features = looked.features
+    found: PhotoFeatures = looked
     return found
 
 
@@ -162,13 +170,17 @@ def _whole(
         if held is None:
             raise AlignmentError("it does not fit the map, which has no place")
         done = held
-    xyz = _swept(done, pictures, job, store) if job.sweep else done.ties.xyz
+    xyz, exposure = done.ties.xyz, NEUTRAL
+    if job.sweep:
+        ground = _ground(done, pictures, job, store)
+        xyz, exposure = _swept(ground), _clouded(ground, job, store)
     return BlockAdjustment(
         ids=job.ids,
         poses={job.ids[k]: p for k, p in done.poses.items()},
         cameras=dict(done.cameras),
         camera_of={job.ids[k]: done.camera_of[k] for k in done.poses},
         xyz=xyz,
+        exposure=exposure,
         rejected={job.ids[k]: why for k, why in done.rejected.items()},
         notes=(*done.notes, *tilt_warnings(job.priors, done, job.most_view_deg))
         if job.thorough
@@ -176,14 +188,10 @@ def _whole(
     )
 
 
-def _swept(
-    done: Alignment, pictures: GreyPictures, job: AdjustmentJob, store: Store
-) -> NDArray[np.float64]:
-    """(P, 3) ground points in m: the surface of the batch workflow at the nodes of its grid below
-    the photos.
-    """
+def _ground(done: Alignment, pictures: GreyPictures, job: AdjustmentJob, store: Store) -> Ground:
+    """The ground of the batch workflow."""
     methods = job.methods
-    ground = result_of(
+    return result_of(
         find_ground(
             done,
             pictures,
@@ -194,6 +202,10 @@ def _swept(
             pictures=picture_recipe(),
         )
     )
+
+
+def _swept(ground: Ground) -> NDArray[np.float64]:
+    """(P, 3) ground points in m: the surface at the nodes of its grid below the photos."""
     surface = ground.surface
     rows, columns = np.mgrid[: surface.z.shape[0], : surface.z.shape[1]]
     xyz = np.column_stack(
@@ -208,6 +220,34 @@ def _swept(
         corners = (view.footprint - (surface.x0, surface.y0)) / surface.cell
         cv2.fillPoly(seen, [np.rint(corners).astype(np.int32)], 1)
     return np.asarray(xyz[seen.ravel() > 0], np.float64)
+
+
+def _clouded(ground: Ground, job: AdjustmentJob, store: Store) -> Exposure:
+    """The photos' exposure as in the batch workflow, by number, where shadows of clouds are found;
+    neutral otherwise, and for photos that are not in colours.
+    """
+    photos = [job.photos[v.photo] for v in ground.views]
+    if any(p.unit or p.dtype != "uint8" or p.channels != 3 for p in photos):
+        return NEUTRAL
+    small = {
+        v.photo: _look(job.photos[v.photo], store, job.methods).thumbnail for v in ground.views
+    }
+    levelled = Levelling(
+        unit="",
+        dtype="uint8",
+        thumbnails=small,
+        balance=job.methods.balance.under(NEUTRAL.white),
+        drift=job.methods.drift,
+        settings=PictureSettings(),
+        mixed=any(p.saved_grey for p in photos),
+    )
+    found = levelled(ground)
+    if not found.shades:
+        return NEUTRAL
+    gains, fields, shades = (
+        {job.ids[k]: v for k, v in of.items()} for of in (found.gains, found.fields, found.shades)
+    )
+    return Exposure(gains=gains, fields=fields, shades=shades)
 
 
 def _part(

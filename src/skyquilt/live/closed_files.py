@@ -50,7 +50,9 @@ class ClosedFiles:
         every = True
         for here, _, _ in walk(Path(folder)):
             number = self._libc.inotify_add_watch(
-                self._handle, os.fsencode(here), CLOSE_WRITE | MOVED_TO | CREATE | DELETE | MOVE_SELF
+                self._handle,
+                os.fsencode(here),
+                CLOSE_WRITE | MOVED_TO | CREATE | DELETE | MOVE_SELF,
             )
             every &= number >= 0
             if number < 0:

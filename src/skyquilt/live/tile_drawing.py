@@ -189,6 +189,12 @@ class Canvas:
             drift=member.photo.unit == "celsius",
         )
 
+    def level(self, exposure: Exposure) -> list[int]:
+        """Takes the brightness of some photos on the map from one that was found for all of them
+        together; returns their numbers.
+        """
+        return self._tone.take(exposure, self._views)
+
     @property
     def exposure(self) -> Exposure:
         """How the photos are balanced so far, by their numbers."""

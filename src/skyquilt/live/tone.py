@@ -2,11 +2,12 @@
 
 The batch map solves for all photos at once. Here a photo gets its correction when it is placed,
 from the ground that it shares with its nearest neighbours, and these keep theirs: so the cost does
-not grow with the map, and no tile has to be drawn again for its tone.
+not grow with the map, and no tile has to be drawn again for its tone. Where shadows of clouds were
+found when photos paused, the corrections found for all photos together replace these (`take`).
 """
 
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from skyquilt.imaging.grey import shrink
 from skyquilt.imaging.nodes import View, project_nodes
 from skyquilt.model.surface import Surface
-from skyquilt.ortho.exposure import Exposure
+from skyquilt.ortho.exposure import Exposure, image_place
 
 Float = NDArray[np.float32]
 Pixels = Callable[[int], NDArray[np.generic]]
@@ -46,24 +47,50 @@ class Tone:
         self._gains: dict[int, Float] = {}
         self._fields: dict[int, Float] = {}
         self._offsets: dict[int, float] = {}
+        self._shades: dict[int, Float] = {}
+        self._taken: set[int] = set()
         self._small: OrderedDict[int, Float] = OrderedDict()
 
     @property
     def exposure(self) -> Exposure:
         """The corrections so far."""
-        return Exposure(gains=self._gains, fields=self._fields, offsets=self._offsets)
+        return Exposure(
+            gains=self._gains, fields=self._fields, offsets=self._offsets, shades=self._shades
+        )
 
     def forget(self, number: int) -> None:
         """Removes a photo."""
-        for held in (self._gains, self._fields, self._offsets, self._small):
+        for held in (self._gains, self._fields, self._offsets, self._shades, self._small):
             held.pop(number, None)
+        self._taken.discard(number)
+
+    def take(self, exposure: Exposure, shown: Container[int]) -> list[int]:
+        """Takes corrections that were found for photos together, as bright as these were in the
+        median; of those that are `shown`, whose numbers are returned.
+        """
+        own = sorted(i for i in exposure.gains if i in shown and i in self._gains)
+        if not own:
+            return []
+        was, now = (np.array([of[i] for i in own]) for of in (self._gains, exposure.gains))
+        level = np.median(was - now, axis=0)
+        for i in own:
+            self._gains[i] = (exposure.gains[i] + level).astype(np.float32)
+            self._fields[i] = exposure.fields[i]
+            self._shades.pop(i, None)
+            if i in exposure.shades:
+                self._shades[i] = exposure.shades[i]
+        self._taken.update(own)
+        return own
 
     def settle(
         self, view: View, others: Sequence[View], surface: Surface, *, measured: bool, drift: bool
     ) -> None:
-        """Finds the correction of a photo from others that are settled. `measured`: its values are
-        temperatures, to which an offset is added if `drift`; colours get a gain per band.
+        """Finds the correction of a photo from others that are settled; it keeps one that was found
+        together with theirs. `measured`: its values are temperatures, to which an offset is added
+        if `drift`; colours get a gain per band.
         """
+        if view.photo in self._taken:
+            return
         low, high = view.footprint.min(0), view.footprint.max(0)
         x, y = np.meshgrid(*(np.linspace(low[k], high[k], POINTS) for k in (0, 1)))
         z = surface.at(x, y)
@@ -71,9 +98,9 @@ class Tone:
         near = sorted(others, key=lambda v: float(np.hypot(*(v.pose.map_C - view.pose.map_C)[:2])))
         lacking = []
         for other in near[:NEIGHBOURS]:
-            values, also = self._values(other, x, y, z, measured=measured)
+            values, also = self._values(other, x, y, z, measured=measured, settled=True)
             if (both := seen & also).sum() >= LEAST:
-                lacking.append((values + self._correction(other.photo) - mine)[both])
+                lacking.append((values - mine)[both])
         change = np.zeros(mine.shape[-1], np.float32)
         if lacking:
             change = np.float32(TRUST) * np.median(np.concatenate(lacking), axis=0)
@@ -84,9 +111,6 @@ class Tone:
         self._gains[view.photo] = np.clip(change, -LARGEST, LARGEST).astype(np.float32)
         self._fields[view.photo] = np.zeros(6, np.float32)
 
-    def _correction(self, number: int) -> Float | float:
-        return self._gains.get(number, self._offsets.get(number, 0.0))
-
     def _values(
         self,
         view: View,
@@ -95,9 +119,10 @@ class Tone:
         z: Float,
         *,
         measured: bool,
+        settled: bool = False,
     ) -> tuple[Float, NDArray[np.bool_]]:
         """Log odds of a photo, or measured values, (r, c, bands) at places on the ground, and where
-        they count.
+        they count; `settled`: corrected.
         """
         nodes = project_nodes(view, x, y, z)
         small = self._picture(view.photo)
@@ -106,10 +131,14 @@ class Tone:
         row = np.clip(np.rint((nodes.v + 0.5) * h / view.camera.height - 0.5), 0, h - 1)
         value = small[row.astype(int), column.astype(int)]
         if measured:
+            value = value + np.float32(self._offsets.get(view.photo, 0.0) if settled else 0.0)
             return value, nodes.seen & nodes.real & np.isfinite(value).all(-1)
         held = nodes.seen & nodes.real & ((value > CLIPPED[0]) & (value < CLIPPED[1])).all(-1)
         safe = np.clip(value, 1, 254)
-        return np.log(safe / (255 - safe)), held
+        level = np.log(safe / (255 - safe))
+        if settled and view.photo in self._gains:
+            level += np.log(self.exposure.odds(view.photo, *image_place(view, nodes.u, nodes.v)))
+        return level, held
 
     def _picture(self, number: int) -> Float:
         """A small, smooth picture (h, w, bands) of a photo."""
