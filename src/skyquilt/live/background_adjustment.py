@@ -31,6 +31,7 @@ from skyquilt.model.surface import Surface
 from skyquilt.ortho.exposure import NEUTRAL, Exposure
 from skyquilt.ortho.ground import Ground, find_ground
 from skyquilt.ortho.radiometry import Levelling
+from skyquilt.ortho.tie_surface import without_outliers
 from skyquilt.photos.pixels import read_color
 from skyquilt.settings import PictureSettings
 from skyquilt.workflows.methods import Methods
@@ -170,7 +171,7 @@ def _whole(
         if held is None:
             raise AlignmentError("it does not fit the map, which has no place")
         done = held
-    xyz, exposure = done.ties.xyz, NEUTRAL
+    xyz, exposure = without_outliers(done.ties.xyz), NEUTRAL
     if job.sweep:
         ground = _ground(done, pictures, job, store)
         xyz, exposure = _swept(ground), _clouded(ground, job, store)
@@ -277,7 +278,7 @@ def _part(
         poses=moved,
         cameras={},
         camera_of={i: job.camera_of[i] for i in moved},
-        xyz=done.xyz,
+        xyz=without_outliers(done.xyz),
     )
 
 

@@ -22,6 +22,7 @@ from skyquilt.live.thermal_notes import ThermalNotes
 from skyquilt.live.veils import LiveVeils
 from skyquilt.model.features import Link
 from skyquilt.model.poses import Pose
+from skyquilt.ortho.tie_surface import without_outliers
 
 LOOP = 12
 """A new link closes a loop if its photos were more than this number of links apart."""
@@ -101,7 +102,8 @@ class Refinement:
             self.members.save_cameras(change.cameras)
             member.tried = self._tried
             whole = bool(change.cameras)
-            self.heights(change.xyz, change.moved, known=whole, together=whole)
+            ground = without_outliers(change.xyz)
+            self.heights(ground, change.moved, known=whole, together=whole)
             self.move(change.moved, change.camera_of)
             self.put_back(change.rejected)
             if member.state == "refined":

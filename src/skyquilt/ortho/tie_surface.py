@@ -66,10 +66,12 @@ class FromTiePoints:
         return np.asarray((weight * points[index, 2]).sum(1) / weight.sum(1))
 
 
-def without_outliers(xyz: Array, limit: float) -> Array:
-    """Points whose height agrees with their neighbours' median within `limit` robust
-    deviations of the survey.
+def without_outliers(xyz: Array, limit: float = FromTiePoints.outlier) -> Array:
+    """Points (P, 3) whose height agrees with their neighbours' median within `limit` robust
+    deviations of the survey; all of them where there are fewer than four.
     """
+    if len(xyz) < 4:
+        return xyz
     k = min(10, len(xyz))
     _, index = nearest(xyz[:, :2], xyz[:, :2], k)
     around = xyz[index, 2]
