@@ -8,6 +8,7 @@ import pytest
 
 from skyquilt.alignment.local_adjustment import AdjustedWindow
 from skyquilt.geometry.frames import rotation_from_vector
+from skyquilt.live import background_adjustment
 from skyquilt.live.apply_adjustment import TOLD
 from skyquilt.live.background_adjustment import BlockAdjustment
 from skyquilt.live.live_map import LiveMap
@@ -151,3 +152,53 @@ def test_warnings_of_whole_adjustments_are_told_once(live, photos, times):
     said = [body for _, kind, body in live.ledger.told(number) if kind == "note"]
     assert sum("So far: Positions lie 15 m off (a.jpg, b.jpg)." in body for body in said) == times
     assert sum("Positions lie" in body for body in said) == times
+
+
+def with_hole(young):
+    """An adjustment of which one tie point, of a wrong match, lies a flying height too low."""
+
+    def adjusted(*given):
+        done = young(*given)
+        xyz = done.ties.xyz.copy()
+        hole = xyz[[0]] - [0.0, 0.0, np.median([p.map_C[2] for p in done.poses.values()])]
+        return replace(done, ties=replace(done.ties, xyz=np.concatenate([xyz, hole])))
+
+    return adjusted
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_a_single_false_tie_point_tells_no_ground(live, monkeypatch, whole):
+    """It drew a corner of a forest 60 m too low, as a lobe of smeared trees."""
+    lowest = []
+    monkeypatch.setattr(live.refinement, "heights", lambda xyz, *_, **__: lowest.append(xyz))
+    if whole:
+        job = live.blocks._job([1, 2, 3, 4], frozenset(), 0.0, thorough=False, sweep=False)
+        monkeypatch.setattr(background_adjustment, "QUICK", with_hole(background_adjustment.QUICK))
+        live.apply_adjustment.apply(background_adjustment.adjust_block(job))
+    else:
+        local = live.refinement.local_pose
+        monkeypatch.setattr(local, "young", with_hole(local.young))
+        live.queues.untried.append(live.members.by_id[4])
+        live.refinement.refine(live.members.by_id[4])
+    (xyz,) = lowest
+    assert len(xyz) > 100 and np.ptp(xyz[:, 2]) < 30.0
+
+
+def test_photos_that_are_not_refined_yet_come_before_those_that_are_once_more(live):
+    """Photos came faster than they were refined: half of the time went to those that had only
+    moved along with others.
+    """
+    queues, known = live.queues, live.members.by_id
+    assert queues.next_untried() is None and queues.unrefined == 0
+    queues.untried.extend([known[1], known[2], known[3]])
+    assert queues.next_untried() is known[1] and queues.unrefined == 0
+    known[2].state = known[3].state = "placed"
+    assert queues.next_untried() is known[2] and queues.unrefined == 2
+    asked = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            live.refinement, "refine", lambda m: asked.append(m) or queues.untried.remove(m)
+        )
+        for _ in range(6):
+            live._refined()
+    assert [m.id for m in asked] == [2, 3, 1]
