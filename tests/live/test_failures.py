@@ -19,7 +19,7 @@ import rasterio
 from skyquilt.engine.lock import FolderLock
 from skyquilt.errors import NoPhotosError, OutputError
 from skyquilt.live import final_map, folder_watch, workflow
-from skyquilt.live.folder_watch import Watch
+from skyquilt.live.folder_watch import REMOVED, Watch
 from skyquilt.live.inbox import Inbox
 from skyquilt.live.ledger import Ledger
 from skyquilt.live.live_map import LiveMap
@@ -201,7 +201,7 @@ def test_names_that_are_no_text_are_taken(tmp_path):
     assert Box(tmp_path).look(0.3) == []  # it is known after a restart
 
 
-def test_a_file_that_is_gone_again_is_forgotten(tmp_path, monkeypatch):
+def test_a_file_that_is_gone_again_is_told_and_forgotten(tmp_path, monkeypatch):
     box = Box(tmp_path)
     (box.folder / "a.jpg").write_bytes(jpeg())
     honest = Watch._unfinished
@@ -211,7 +211,8 @@ def test_a_file_that_is_gone_again_is_forgotten(tmp_path, monkeypatch):
         return honest(self, path, **more)
 
     monkeypatch.setattr(Watch, "_unfinished", gone)
-    assert box.look(0.5) == [] and box.watch.growing == {}
+    told = [REMOVED] if box.watch._closed.told else []
+    assert [f.reason for f in box.look(0.5)] == told and box.watch.growing == {}
 
 
 def test_a_file_that_is_too_large_is_refused_and_the_next_is_taken(tmp_path):
