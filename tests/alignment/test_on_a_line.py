@@ -147,3 +147,12 @@ def test_photos_of_several_headings_and_told_angles_say_nothing():
     assert level_untold(both, priors) is both
     stated = [replace(p, sigma_tilt_deg=1.0) for p in priors]
     assert level_untold(found, stated) is found
+
+
+def test_a_receiver_that_is_stuck_tells_no_scale():
+    _, found, priors = flown(15.0)
+    stuck = [replace(p, map_C=np.array([3.0, 4.0, np.nan])) for p in priors]
+    done = level_untold(found, stuck)
+    apart = [np.linalg.norm(d.poses[8].map_C - d.poses[0].map_C) for d in (done, found)]
+    assert apart[0] == pytest.approx(apart[1])
+    assert dominant_normal(done.ties.xyz, 1.5)[2] > np.cos(np.radians(0.5))

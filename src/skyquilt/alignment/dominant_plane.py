@@ -49,6 +49,8 @@ RISES_DEG = 5.0
 """Ground and flight rise alike where both rise by more, and differ by less. Over a hillside, a
 drone that keeps its height does not rise.
 """
+MOST_SCALED = 2.0
+"""Factor by which a map that was laid level is enlarged or reduced at most."""
 UNTOLD = (
     "No file tells heights or camera angles, and photos are headed alike: nothing tells how the map"
     " is tilted along the flight."
@@ -179,11 +181,13 @@ def _common_rise(C: Array, xyz: Array) -> tuple[Array, bool]:
 
 def _on_positions(found: Alignment, held: Sequence[int], priors: Sequence[Prior]) -> Alignment:
     """The alignment enlarged, turned about the vertical and moved sideways so that photos lie where
-    they report to be.
+    they report to be; as it is where positions tell nothing of its scale (a stuck receiver).
     """
     x = np.array([found.poses[i].map_C[:2] for i in held]) @ (1, 1j)
     y = np.array([priors[i].map_C[:2] for i in held]) @ (1, 1j)
     g, c, _ = fit_similarity(x, y, np.array([priors[i].sigma_C[0] for i in held]))
+    if not 1 / MOST_SCALED < abs(g) < MOST_SCALED:
+        return found
     cos, sin = g.real / abs(g), g.imag / abs(g)
     turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
     middle = np.median(found.ties.xyz, axis=0)
