@@ -92,7 +92,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 95
+    version: ClassVar[int] = 96
 
     def __call__(
         self,
