@@ -234,7 +234,7 @@ def test_an_error_of_a_gimbal_that_pictures_contradict_is_not_corrected(fit, cor
     survey = repairs.Survey(
         names=[], cameras=["c"] * len(told), speeds=None, linked=len(told),
         adjust=lambda begun: residuals(right, 0.1 * fit), unfit=None, cut=None, focals=None,
-        wholes=None, false_focals=None, beginnings=None, guess=None, sizes=dict,
+        wholes=None, false_focals=None, beginnings=None, guess=None, sizes=lambda cut: {},
     )  # fmt: skip
     first = repairs.Tried(found=residuals(found, 0.1), begun=repairs.Beginning(priors=told))
     assert (repairs._common_tilts(first, survey) is not first) == corrected

@@ -270,7 +270,7 @@ def test_photos_that_stay_turned_are_hung_on_the_others(ahead):
         speeds=None,
         linked=len(flown.photos),
         adjust=adjust,
-        sizes=dict,
+        sizes=lambda cut: {},
         unfit=None,
         false_focals=None,
         cut=None,

@@ -121,6 +121,18 @@ def test_sizes_of_one_lens_count_as_zooms_of_the_most_frequent_one():
     assert {z.sigma for z in found.values()} == {0.0, 0.01}
 
 
+def test_sizes_that_are_parts_count_as_they_are():
+    photos = [sized("a", 1.0), sized("b", 0.5), sized("c", 0.5, zoom=2.0)]
+    found = lenses_of_sizes(photos, cut=True)
+    assert [found[p.camera_key].factor for p in photos] == [1.0, 1.0, 2.0]
+    own = as_of_sizes(photos, found)  # what the largest tells
+    assert [p.focal.px for p in own] == [FOCAL, FOCAL, 2 * FOCAL]
+    tied = common(list(found.values()))
+    K = np.array([seen_through(LENS, z.factor) for z in found.values()])
+    K[1, 1:3] -= 60.0  # the middle of the lens is anywhere in a part
+    assert np.abs(tied.rows @ K.ravel() - tied.zero).max() < 1e-8
+
+
 def test_one_size_is_no_lens_of_several_nor_are_upright_pictures_of_wide_ones():
     upright = replace(sized("b", 1.0), width=HEIGHT, height=WIDTH, camera_key="cam 600x800 4.0mm")
     assert lenses_of_sizes([sized("a", 1.0), upright, sized("c", 1.0, zoom=2.0)]) == {}
@@ -162,9 +174,11 @@ def flown_with_tilts():
 def test_parts_that_were_cut_out_are_no_smaller_pictures():
     flown = reduced(Flown(3, lines=3, per_line=4, points=500, gps=1.0), cut=True)
     found = flown.aligned()
-    assert not any("the same lens" in note for note in found.notes)
-    focals = {round(c.focal / FOCAL, 1) for c in found.cameras.values()}
-    assert focals == {1.0}
+    assert any("parts of what the same lens took" in note for note in found.notes)
+    whole, part = (found.cameras[f"cam {WIDTH // k}x{HEIGHT // k}"] for k in (1, 2))
+    assert part.focal == pytest.approx(whole.focal, rel=3e-3)
+    assert part.cx == pytest.approx(whole.cx - WIDTH / 4, abs=5)
+    assert part.cy == pytest.approx(whole.cy - HEIGHT / 4, abs=5)
     zooms = lenses_of_sizes(flown.photos)
     cameras = [p.camera_key for p in flown.photos]
     assert unlike(found, cameras, zooms, flown.priors)

@@ -158,7 +158,7 @@ def flown_as(find):
     """A survey whose adjustment finds principal points by what it is begun with."""
     priors = priors_by_camera([photo(f"{i}.jpg") for i in range(8)], "full")
     return repairs.Survey(
-        names=[], cameras=[], speeds=None, linked=8, adjust=find, guess=None, sizes=dict,
+        names=[], cameras=[], speeds=None, linked=8, adjust=find, guess=None, sizes=lambda cut: {},
         beginnings=None,
         unfit=lambda t: frozenset(), focals=lambda t: ({}, True), false_focals=lambda t: ({}, True),
         cut=lambda t: cut_cameras(t.found, priors),

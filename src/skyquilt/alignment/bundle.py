@@ -56,7 +56,7 @@ from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.errors import AlignmentError
 from skyquilt.geometry.set_aside import SetAside
 from skyquilt.model.features import Features, Link
-from skyquilt.model.photo import Photo
+from skyquilt.model.photo import Focal, Photo
 from skyquilt.model.poses import Alignment, MapFrame, Prior, TiePoints
 
 ASIDE_AGAIN = 3
@@ -92,7 +92,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 96
+    version: ClassVar[int] = 97
 
     def __call__(
         self,
@@ -115,8 +115,11 @@ class Bundle:
             AlignmentError: no two photos are linked.
         """
 
+        def sized(begun: Beginning) -> Sequence[Photo]:
+            return as_of_sizes(photos, begun.sizes) if begun.sizes else photos
+
         def taken(begun: Beginning) -> Sequence[Photo]:
-            own = as_of_sizes(photos, begun.sizes) if begun.sizes else photos
+            own = sized(begun)
             own = with_focals(own, begun.focals) if begun.focals else own
             own = as_of_lenses(own, begun.lenses) if begun.lenses else own
             return as_enlarged(own, begun.enlarged) if begun.enlarged else own
@@ -138,21 +141,30 @@ class Bundle:
         def priors_of(tried: Tried) -> CameraPriors:
             return priors_by_camera(taken(tried.begun), self.distortion)
 
-        guesses = {p.camera_key: p.focal for p in photos if p.lens_guessed}
-        told = {p.camera_key: p.focal for p in photos if p.focal_alone}
-        doubtful = (guesses.keys() | told.keys()) - {p.camera_key for p in photos if p.whole_told}
+        def guesses(begun: Beginning) -> dict[str, Focal]:
+            return {p.camera_key: p.focal for p in sized(begun) if p.lens_guessed}
+
+        def told(begun: Beginning) -> dict[str, Focal]:
+            return {p.camera_key: p.focal for p in sized(begun) if p.focal_alone}
+
+        def wholes(tried: Tried) -> dict[str, float]:
+            begun = tried.begun
+            doubtful = guesses(begun).keys() | told(begun).keys()
+            doubtful -= {p.camera_key for p in photos if p.whole_told} | begun.sizes.keys()
+            return whole_focals(tried.found, begun.cut & doubtful, begun.focals)
+
         survey = Survey(
             names=[p.name for p in photos],
             cameras=[p.camera_key for p in photos],
             speeds=speeds_of(photos),
             linked=len({i for k in links for i in (k.a, k.b)}),
             adjust=adjust,
-            sizes=lambda: lenses_of_sizes(photos),
+            sizes=lambda cut: lenses_of_sizes(photos, cut=cut),
             unfit=lambda t: unfit_cameras(t.found, priors_of(t)),
             cut=lambda t: cut_cameras(t.found, priors_of(t)),
-            wholes=lambda t: whole_focals(t.found, t.begun.cut & doubtful, t.begun.focals),
-            focals=lambda t: other_focals(t.found, guesses, t.begun.focals),
-            false_focals=lambda t: false_focals(t.found, told, t.begun.focals),
+            wholes=wholes,
+            focals=lambda t: other_focals(t.found, guesses(t.begun), t.begun.focals),
+            false_focals=lambda t: false_focals(t.found, told(t.begun), t.begun.focals),
             beginnings=lambda t: beginnings(t.found, photos, t.begun.priors),
             guess=guess,
         )

@@ -70,6 +70,10 @@ BEGUN_AGAIN = 5
 """An oblique survey without camera angles is adjusted again as it was found, so often at most, as
 long as photos come nearer to their positions.
 """
+ONE_LENS = 1.05
+"""Pictures of several sizes fit one lens at most so many times as badly as a lens for each size,
+which has some ten parameters more for each.
+"""
 FOCALS_AGAIN = 6
 """Focal lengths are guessed again so often at most: each time an adjustment comes nearer."""
 
@@ -98,23 +102,25 @@ def repaired(first: Tried, survey: Survey) -> Tried:
     for repair in REPAIRS:
         first = repair(first, survey)
     begun, found = first.begun, first.found
-    cut, loose = (cameras & found.cameras.keys() for cameras in (begun.cut, begun.loose))
+    cut = begun.cut & found.cameras.keys() - begun.sizes.keys()
+    loose = begun.loose & found.cameras.keys()
     said = (*cut_notes(found, cut), *unfit_notes(found, loose))
     return replace(first, notes=(*first.notes, *said))
 
 
 def _one_lens(last: Tried, survey: Survey) -> Tried:
-    """Pictures of several sizes that one lens took are calibrated together. A part that was cut
-    out is no smaller picture of the whole: then photos fit worse, or contradict it.
+    """Pictures of several sizes that one lens took are calibrated together: reduced ones, or else
+    parts that were cut out, whose principal points pictures alone tell.
     """
-    sizes = survey.sizes() if len(set(survey.cameras)) > 1 else {}
-    if not sizes:
-        return last
-    other = survey.tried(last.begun, sizes=sizes, name="sizes ")
-    false = unlike(other.found, survey.cameras, sizes, last.begun.priors)
-    if false or not fits_as_well(other.found, last.found):
-        return last
-    return replace(other, notes=(*last.notes, sizes_note(sizes)))
+    for cut in (False, True) if len(set(survey.cameras)) > 1 else ():
+        if not (sizes := survey.sizes(cut)):
+            break
+        parts = last.begun.cut.union(sizes if cut else ())
+        other = survey.tried(last.begun, sizes=sizes, cut=parts, name=f"sizes {cut} ")
+        false = unlike(other.found, survey.cameras, sizes, last.begun.priors)
+        if not false and fits_as_well(other.found, last.found, worse=ONE_LENS):
+            return replace(other, notes=(*last.notes, sizes_note(sizes)))
+    return last
 
 
 def _guessed_focals(last: Tried, survey: Survey) -> Tried:

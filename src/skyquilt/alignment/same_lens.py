@@ -19,11 +19,12 @@ from skyquilt.alignment.problem import InCommon
 from skyquilt.model.camera import PARAMETERS
 from skyquilt.model.photo import Photo, Zoom
 from skyquilt.model.poses import Alignment, Prior
+from skyquilt.photos.side_rows import sentence_of
 
 Array = NDArray[np.float64]
 ROUNDED = 3e-3
 """Deviation of a factor that files tell, as a share: they tell it with two decimals."""
-UNLIKE = 1 + 5 * ROUNDED
+UNLIKE = 1 + 2 * ROUNDED
 """Focal lengths of one lens, each over its factor, differ by this factor at most."""
 OFF_CENTRE = 5e-4
 """Deviation of the middle of what is enlarged, as a share of the picture's longer side."""
@@ -43,6 +44,8 @@ def same_lens(
         own = [k for k, zoom in enumerate(zooms) if zoom.camera == lens]
         for column, name in enumerate(PARAMETERS) if len(own) > 1 else ():
             if name not in {"focal", "cx", "cy", *DEVIATION} or not free[own, column].all():
+                continue
+            if name in {"cx", "cy"} and not all(zooms[k].centred for k in own):
                 continue
             value, at_zero, sigma = _of_lens(name, [zooms[k] for k in own], K0[own, 0], size[own])
             weight = sigma**-2 / (sigma**-2).sum()
@@ -70,10 +73,11 @@ def _of_lens(
     return 1 / factor, middle / factor, OFF_CENTRE * size.max(1)
 
 
-def lenses_of_sizes(photos: Sequence[Photo]) -> dict[str, Zoom]:
+def lenses_of_sizes(photos: Sequence[Photo], *, cut: bool = False) -> dict[str, Zoom]:
     """Cameras (names) whose pictures differ from others by their size alone, as zooms of what may
     be one lens: the size that most photos have counts as 1, others as all of it on more or fewer
-    px. Of wide and upright pictures each are their own lens: one of them was turned.
+    px; or, with `cut`, as parts of it that were cut out. Of wide and upright pictures each are
+    their own lens: one of them was turned.
     """
     first = {p.camera_key: p for p in reversed(photos)}
     number = Counter(p.camera_key for p in photos)
@@ -86,9 +90,9 @@ def lenses_of_sizes(photos: Sequence[Photo]) -> dict[str, Zoom]:
         sizes = {(first[k].width, first[k].height) for k in keys}
         usual = widths[max(keys, key=lambda k: number[k])]
         for key in keys if len(sizes) > 1 else ():
-            own = first[key].zoom
-            factor = (own.factor if own else 1.0) * widths[key] / usual
-            out[key] = Zoom(camera=lens, factor=factor, sigma=own.sigma if own else 0.0)
+            own = first[key].zoom or Zoom(camera=lens, factor=1.0)
+            factor = own.factor if cut else own.factor * widths[key] / usual
+            out[key] = replace(own, camera=lens, factor=factor, centred=not cut)
     return out
 
 
@@ -100,11 +104,12 @@ def _sizeless(photo: Photo) -> str:
 
 def as_of_sizes(photos: Sequence[Photo], zooms: Mapping[str, Zoom]) -> list[Photo]:
     """The photos, those of several sizes as of their lens: what files tell of the most frequent
-    size (of what is not zoomed) is believed of all, once. Programs that reduce pictures leave
-    metadata that count in px of the larger ones.
+    size (of what is not zoomed; of parts, the largest) is believed of all, once. Programs that
+    reduce pictures leave metadata that count in px of the larger ones, and those that cut leave
+    some that count for the whole.
     """
     told: dict[str, Photo] = {}
-    for photo in photos:
+    for photo in sorted(photos, key=lambda p: -p.width * p.height):
         zoom = zooms.get(photo.camera_key)
         if zoom is not None and zoom.factor == 1:
             told.setdefault(zoom.camera, photo)
@@ -160,7 +165,9 @@ def unlike(
 
 def sizes_note(zooms: Mapping[str, Zoom]) -> str:
     """What the user is told."""
+    cut = not all(zoom.centred for zoom in zooms.values())
+    how = "show parts of what the same lens took" if cut else "show the same lens"
     return (
-        "Photos that differ from others of their camera by their size show the same lens, so they"
-        f" are calibrated together: {'; '.join(sorted(zooms))}."
+        f"Photos that differ from others of their camera by their size {how}, so they are"
+        f" calibrated together: {sentence_of(sorted(zooms))}."
     )

@@ -69,8 +69,10 @@ class Survey:
     """How many photos have links."""
     adjust: Callable[[Beginning], Alignment]
     """Adjusts the survey."""
-    sizes: Callable[[], Mapping[str, Zoom]]
-    """Cameras whose pictures differ from others by their size alone (`lenses_of_sizes`)."""
+    sizes: Callable[[bool], Mapping[str, Zoom]]
+    """Cameras whose pictures differ from others by their size alone, as reduced ones, or (true) as
+    parts (`lenses_of_sizes`).
+    """
     unfit: Callable[[Tried], frozenset[str]]
     """Names of cameras that photos contradict (`unfit_cameras`)."""
     cut: Callable[[Tried], frozenset[str]]

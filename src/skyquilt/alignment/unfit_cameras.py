@@ -137,11 +137,11 @@ def loosened(setup: Setup, cameras: Collection[str]) -> Setup:
     return replace(setup, base=replace(setup.base, sigma_K=sigma))
 
 
-def fits_as_well(other: Alignment, found: Alignment) -> bool:
-    """Whether an alignment holds as many photos as another, and fits the pictures about as well or
-    better.
+def fits_as_well(other: Alignment, found: Alignment, *, worse: float = WORSE) -> bool:
+    """Whether an alignment holds as many photos as another, and fits the pictures about as well (at
+    most so many times `worse`) or better.
     """
-    as_well = misfit_px(other) <= WORSE * misfit_px(found)
+    as_well = misfit_px(other) <= worse * misfit_px(found)
     return as_well and len(other.held) >= len(found.held)
 
 

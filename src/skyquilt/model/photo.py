@@ -105,7 +105,9 @@ class Focal:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Zoom:
-    """A digital zoom: the middle of a camera's picture, enlarged to the size of the whole."""
+    """A digital zoom: the middle of a camera's picture, enlarged to the size of the whole; or a
+    part of it that was cut out.
+    """
 
     camera: str
     """`Photo.camera_key` of the camera without it."""
@@ -113,6 +115,8 @@ class Zoom:
     """How many times as large the ground looks."""
     sigma: float = 0.0
     """Standard deviation of the factor, as a share of it."""
+    centred: bool = True
+    """Whether it shows the middle of the picture, and not any part of it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
