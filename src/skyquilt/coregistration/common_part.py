@@ -46,6 +46,7 @@ class CommonPart:
             px_a=outcome.px_a + self.shift_a,
             px_b=outcome.px_b + self.shift_b,
             error=outcome.error and outcome.error.moved(1.0, self.shift_b),
+            lens_error=outcome.lens_error and outcome.lens_error.moved(1.0, self.shift_b),
         )
 
 

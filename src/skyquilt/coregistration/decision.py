@@ -115,7 +115,7 @@ class Decide:
             if self.state.determined(scatter, change, corners) > self.determined:
                 model, fit = freer.freedom, freer
                 agreement = self.agree(a, b, fit.b_H_a)
-        full, error = self._closer(pyramid, fit, model)
+        full, error, lens_error = self._closer(pyramid, fit, model)
         to_full = np.linalg.inv(b.small_S_full)
         found = between(a, b, full)
         apart = self.bent(
@@ -130,11 +130,14 @@ class Decide:
             px_a=_apply(np.linalg.inv(full) @ to_full, agreement.px),
             px_b=_apply(to_full, agreement.px + agreement.shift),
             error=error,
+            lens_error=lens_error,
         )
 
-    def _closer(self, pyramid: Pyramid, coarse: Fit, model: Freedom) -> tuple[Matrix, ErrorField]:
-        """The weighted mean of the transforms by coarse and by finer structure, and its error, both
-        in px of the images. How far they are apart tells of the error what the scatter of the
+    def _closer(
+        self, pyramid: Pyramid, coarse: Fit, model: Freedom
+    ) -> tuple[Matrix, ErrorField, ErrorField]:
+        """The weighted mean of the transforms by coarse and by finer structure, its error, and that
+        through a lens, all in px of the images. How far they are apart tells of the error what the scatter of the
         patches does not.
         """
         full, side = pyramid.full(coarse.b_H_a, pyramid.last), self.finer
@@ -146,17 +149,28 @@ class Decide:
         a, b = pyramid.finer(side, self.sharper)
         begun = between(a, b, full)
         fine = SubpixelRefinement(freedom=model, steps=8)(a, b, begun).b_H_a
-        scatter = self._scatter(
-            self.agree.shifts(a, b, fine), overlap_corners(fine, a.shape, b.shape), b.shape, model
-        )
+        patches, corners = self.agree.shifts(a, b, fine), overlap_corners(fine, a.shape, b.shape)
+        scatter = self._scatter(patches, corners, b.shape, model)
         px = grid(b.shape)
         apart = transfer(begun @ np.linalg.inv(fine), px) - px
         back = fitted(model, px, px + (1 - self.fine) * apart)
         to_full = np.linalg.inv(b.small_S_full)
-        error = self.state(scatter, FREE[model], scatter.parameters(px, apart))
-        return full_size(a, b, fine if back is None else back @ fine), error.moved(
-            float(to_full[0, 0]), np.asarray(to_full[:2, 2], np.float64)
+        change = scatter.parameters(px, apart)
+        alike = fitted("similarity", transfer(np.linalg.inv(fine), px), px)
+        usual = np.zeros_like(px) if alike is None else transfer(alike @ np.linalg.inv(fine), px) - px
+        bent = self.state.bent(
+            patches,
+            scatter.parameters(px, usual),
+            centre=scatter.centre,
+            unit=scatter.unit,
+            reach=float(self.agree.reach),
+            apart=change,
         )
+        errors = (
+            e.moved(float(to_full[0, 0]), np.asarray(to_full[:2, 2], np.float64))
+            for e in (self.state(scatter, FREE[model], change), bent)
+        )
+        return full_size(a, b, fine if back is None else back @ fine), *errors
 
     def _scatter(
         self, patches: Shifts, corners: NDArray[np.float64], shape: tuple[int, int], model: Freedom

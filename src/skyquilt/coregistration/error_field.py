@@ -9,6 +9,7 @@ place in two spectra; and with priors in units of the scatter, the part of the t
 the chosen model cannot follow (parallax, lens, perspective), and an error that all patches share.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -93,7 +94,11 @@ class StateError:
     """Scatter expected without any patch, px; it counts as much as `weight` observations."""
     weight: float = 3.0
     """See `least_px`."""
-    version: ClassVar[int] = 4
+    lens: float = 0.02
+    """Prior of each parameter beyond a similarity where a picture was taken through a lens, at half
+    b's diagonal, as a share of that: distortion, and perspective by a tilt of some degrees.
+    """
+    version: ClassVar[int] = 5
 
     def scatter(
         self, patches: Shifts, *, centre: NDArray[np.float64], unit: float, reach: float, free: int
@@ -105,27 +110,88 @@ class StateError:
         patches: in px of b; centre, unit: of `offsets`; reach: largest shift compared; free:
         parameters of the model.
         """
-        px, shift, width = patches.px, patches.shift, patches.width
-        J = offsets(px, centre, unit)
-        prior = self._prior(free)
+        J, prior = offsets(patches.px, centre, unit), self._prior(free)
+        return self._separated(
+            patches, J, lambda _: prior, np.zeros(8), centre=centre, unit=unit, reach=reach
+        )[0]
+
+    def bent(
+        self,
+        patches: Shifts,
+        usual: NDArray[np.float64],
+        *,
+        centre: NDArray[np.float64],
+        unit: float,
+        reach: float,
+        apart: NDArray[np.float64],
+    ) -> ErrorField:
+        """The error over b, and how far it departs, where a picture was taken through a lens and
+        not quite from above: as the patches tell, and where there are none, by what lenses and tilts
+        usually do.
+
+        usual: (8,) parameters of `offsets` from the registration to the similarity nearest to it;
+        apart: (8,) as in `__call__`; the rest as in `scatter`.
+        """
+        J = offsets(patches.px, centre, unit, lens=True)
+        count = J.shape[2]
+        deviation = np.full(count, self.lens * unit)
+        deviation[: FREE["similarity"]] = _FLAT * unit
+        expected, more = np.zeros(count), np.zeros(count)
+        expected[FREE["similarity"] : 8], more[:8] = usual[FREE["similarity"] :], apart
+        known = np.diag(1 / deviation**2)
+        scatter, found = self._separated(
+            patches, J, lambda s: known * s**2, expected, centre=centre, unit=unit, reach=reach
+        )
+        square = self._square(scatter)
+        covariance = np.linalg.inv(scatter.information / square + known)
+        return ErrorField(
+            centre=centre,
+            unit=unit,
+            covariance=covariance + self.apart**2 * np.outer(more, more),
+            shared=self.shared**2 * square,
+            departure=found,
+        )
+
+    def _separated(
+        self,
+        patches: Shifts,
+        J: NDArray[np.float64],
+        prior_of: Callable[[float], NDArray[np.float64]],
+        expected: NDArray[np.float64],
+        *,
+        centre: NDArray[np.float64],
+        unit: float,
+        reach: float,
+    ) -> tuple[Scatter, NDArray[np.float64]]:
+        """The scatter of the patches that match near the registered position, and the parameters
+        (k,) that they tell by their derivatives J (n, 2, k); `prior_of`: (k, k) information for a
+        sigma of 1 px, by sigma, of parameters that are as `expected`.
+        """
+        shift, width = patches.shift, patches.width
         near = np.hypot(shift[:, 0], shift[:, 1]) < reach / 4
         typical = float(np.median(width[near])) if near.any() else 1.0
         likely = near.astype(np.float64)
-        share, sigma, data = 1 - _OUTLIER, 1.0, np.zeros((8, 8))
+        share, sigma, data = 1 - _OUTLIER, 1.0, np.zeros((len(expected), len(expected)))
+        p = expected
         for _ in range(_ROUNDS):
+            prior = prior_of(sigma)
             data = np.einsum("n,nij,nik->jk", likely, J, J)
-            p = np.linalg.solve(data + prior, np.einsum("n,nij,ni->j", likely, J, shift))
+            told = np.einsum("n,nij,ni->j", likely, J, shift) + prior @ expected
+            p = np.linalg.solve(data + prior, told)
             off = ((shift - J @ p) ** 2).sum(1)
             used = float(np.trace(np.linalg.solve(data + prior, data)))
-            square = float(likely @ off) + float(p @ prior @ p) + self.weight * self.least_px**2
+            beside = p - expected
+            square = float(likely @ off) + float(beside @ prior @ beside)
+            square += self.weight * self.least_px**2
             spare = max(2 * float(likely.sum()) - used, 1.0) + self.weight
             sigma = max(float(np.sqrt(square / spare)), self.least_px)
             density = share * np.exp(-off / (2 * sigma**2)) / (2 * np.pi * sigma**2)
             likely = density / (density + (1 - share) / (2 * reach + 1) ** 2)
             share = float(np.clip(likely.mean(), 0.05, 0.98))
-        return Scatter(
+        scatter = Scatter(
             sigma=sigma, width=typical, share=share, information=data, centre=centre, unit=unit
         )
+        return scatter, p
 
     def _prior(self, free: int) -> NDArray[np.float64]:
         """(8, 8) information of the prior for a sigma of 1 px."""
@@ -139,10 +205,7 @@ class StateError:
         """The error over b of a model with so many free parameters; `apart` (8,): the parameters by
         which two registrations differ whose mean it is.
         """
-        width = max(scatter.width, _NARROWEST) / self.usual_width
-        rare = self.usual_share / scatter.share
-        square = self.dependence * scatter.sigma**2
-        square *= width ** (2 * self.blur) * rare ** (2 * self.rarity)
+        square = self._square(scatter)
         square *= self.chosen**2 if free == FREE["homography"] else 1.0
         covariance = square * np.linalg.inv(scatter.information + self._prior(free))
         if apart is not None:
@@ -153,6 +216,13 @@ class StateError:
             covariance=np.asarray(covariance, np.float64),
             shared=self.shared**2 * square,
         )
+
+    def _square(self, scatter: Scatter) -> float:
+        """Variance in px^2 of what one patch tells."""
+        width = max(scatter.width, _NARROWEST) / self.usual_width
+        rare = self.usual_share / scatter.share
+        square = self.dependence * scatter.sigma**2
+        return float(square * width ** (2 * self.blur) * rare ** (2 * self.rarity))
 
     def determined(
         self, scatter: Scatter, change_px: NDArray[np.float64], at: NDArray[np.float64]

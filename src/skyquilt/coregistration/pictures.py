@@ -121,6 +121,15 @@ class Source:
     """Its georeference, if it has one."""
 
     @property
+    def through_lens(self) -> bool:
+        """Whether the file says that a camera took it, so that a lens bends it and perspective is
+        in it.
+        """
+        return self.photo is not None and (
+            self.photo.focal.source != "guess" or bool(self.photo.unit)
+        )
+
+    @property
     def unit(self) -> str:
         """Unit of the values; empty for colour images."""
         return self.photo.unit if self.photo else self.place.unit if self.place else ""

@@ -120,7 +120,8 @@ def outcome_of(a: Source, b: Source, method: str, guess: Guess | None) -> Outcom
         return outcome
     full_a, full_b = a.full_S_picture, b.full_S_picture
     matrix = full_b @ outcome.b_H_a @ np.linalg.inv(full_a)
-    error = outcome.error and outcome.error.seen_in(full_b)
+    error = outcome.lens_error if a.through_lens or b.through_lens else outcome.error
+    error = error and error.seen_in(full_b)
     if outcome.model == "similarity" and not _similar(matrix):
         outcome = replace(outcome, model="affine")  # of files whose pixels are longer than wide
     if _same(a, b):
@@ -130,7 +131,7 @@ def outcome_of(a: Source, b: Source, method: str, guess: Guess | None) -> Outcom
             note="A and B are the same picture: it lies on itself, unmoved.",
         )
         matrix = np.eye(3)
-        error = error and replace(error, covariance=np.zeros((8, 8)), shared=0.0)
+        error = error and replace(error, covariance=np.zeros((8, 8)), shared=0.0, departure=None)
     px_a, px_b = _scaled(outcome.px_a, full_a), _scaled(outcome.px_b, full_b)
     q = spread_quality(px_a, a.width, a.height, delta=0.1 * a.width)
     return replace(outcome, b_H_a=matrix / matrix[2, 2], px_a=px_a, px_b=px_b, q=q, error=error)

@@ -46,14 +46,19 @@ class Guess:
     """Where it comes from, as a phrase."""
 
 
-def offsets(px: NDArray[np.float64], centre: NDArray[np.float64], unit: float) -> Matrix:
+def offsets(
+    px: NDArray[np.float64], centre: NDArray[np.float64], unit: float, *, lens: bool = False
+) -> Matrix:
     """(n, 2, 8) changes in px of places (n, 2) by the parameters of a small homography: shifts,
     scale and rotation (the similarity), two shears (with them the affine transform), two
-    perspectives. Each is in px, at distance `unit` from `centre`.
+    perspectives. Each is in px, at distance `unit` from `centre`. `lens`: (n, 2, 13), what a lens
+    changes besides, wherever its middle lies: the other four squares, and the third power of the
+    distance.
     """
     x, y = ((px - centre) / unit).T
     one, none = np.ones_like(x), np.zeros_like(x)
-    columns = (
+    square = x * x + y * y
+    columns: tuple[tuple[NDArray[np.float64], NDArray[np.float64]], ...] = (
         (one, none),
         (none, one),
         (x, y),
@@ -63,6 +68,14 @@ def offsets(px: NDArray[np.float64], centre: NDArray[np.float64], unit: float) -
         (x * x, x * y),
         (x * y, y * y),
     )
+    if lens:
+        columns += (
+            (x * x, -x * y),
+            (-x * y, y * y),
+            (y * y, none),
+            (none, x * x),
+            (x * square, y * square),
+        )
     return np.stack([np.stack(column, 1) for column in columns], 2)
 
 
@@ -81,11 +94,15 @@ class ErrorField:
     unit: float
     """Unit of length of `offsets`, px of b."""
     covariance: NDArray[np.float64]
-    """(8, 8) of the parameters of `offsets`, px^2."""
+    """(8, 8) of the parameters of `offsets`, px^2; (13, 13) with those of a lens."""
     shared: float
     """Variance per axis of an error that is the same everywhere, px^2."""
     full_S_own: Matrix = field(default_factory=lambda: np.eye(3))
     """(3, 3) affine: from the px of b in which all this is, to those in which it is asked for."""
+    departure: NDArray[np.float64] | None = None
+    """(13,) parameters of `offsets` by which b departs from the registration as far as patches tell
+    it, px; None: by none.
+    """
 
     def bound_px(self, px: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n,) distance in px of b within which the registration is right with 95 %, at px (n, 2)
@@ -93,12 +110,15 @@ class ErrorField:
         """
         linear, shift = self.full_S_own[:2, :2], self.full_S_own[:2, 2]
         own = (np.asarray(px, np.float64) - shift) @ np.asarray(np.linalg.inv(linear).T, np.float64)
-        J = offsets(own, self.centre, self.unit)
+        J = offsets(own, self.centre, self.unit, lens=len(self.covariance) > 8)
         every = np.einsum("nij,jk,nlk->nil", J, self.covariance, J) + self.shared * np.eye(2)
         (xx, xy), (_, yy) = np.einsum("ai,nil,bl->abn", linear, every, linear)
         middle, half = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
         along, across = middle + half, np.maximum(middle - half, 0)
-        return np.asarray(np.sqrt(ALONG * along + (ROUND - ALONG) * across))
+        bound = np.sqrt(ALONG * along + (ROUND - ALONG) * across)
+        if self.departure is not None:
+            bound = bound + np.linalg.norm(J @ self.departure @ linear.T, axis=1)
+        return np.asarray(bound)
 
     def moved(self, scale: float, shift: NDArray[np.float64]) -> "ErrorField":
         """The same in other pixels of b: multiplied by a factor, then shifted."""
@@ -132,6 +152,8 @@ class Registration:
     """Spread of the inliers over a [Yahyanejad 2013, (6.3)], in [0, 1]."""
     error: ErrorField | None = None
     """How far it may be off, over b; None by methods that do not measure it."""
+    lens_error: ErrorField | None = None
+    """The same where a or b was taken through a lens, which the model leaves out."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
