@@ -137,8 +137,8 @@ class Decide:
         self, pyramid: Pyramid, coarse: Fit, model: Freedom
     ) -> tuple[Matrix, ErrorField, ErrorField]:
         """The weighted mean of the transforms by coarse and by finer structure, its error, and that
-        through a lens, all in px of the images. How far they are apart tells of the error what the scatter of the
-        patches does not.
+        through a lens, all in px of the images. How far they are apart tells of the error what the
+        scatter of the patches does not.
         """
         full, side = pyramid.full(coarse.b_H_a, pyramid.last), self.finer
         if pyramid.least >= self.finest**2:
@@ -156,21 +156,12 @@ class Decide:
         back = fitted(model, px, px + (1 - self.fine) * apart)
         to_full = np.linalg.inv(b.small_S_full)
         change = scatter.parameters(px, apart)
-        alike = fitted("similarity", transfer(np.linalg.inv(fine), px), px)
-        usual = np.zeros_like(px) if alike is None else transfer(alike @ np.linalg.inv(fine), px) - px
-        bent = self.state.bent(
-            patches,
-            scatter.parameters(px, usual),
-            centre=scatter.centre,
-            unit=scatter.unit,
-            reach=float(self.agree.reach),
-            apart=change,
-        )
-        errors = (
-            e.moved(float(to_full[0, 0]), np.asarray(to_full[:2, 2], np.float64))
-            for e in (self.state(scatter, FREE[model], change), bent)
-        )
-        return full_size(a, b, fine if back is None else back @ fine), *errors
+        usual = scatter.parameters(px, _to_similarity(fine, px))
+        bent = self.state.bent(patches, scatter, usual, corners, float(self.agree.reach), change)
+        error = self.state(scatter, FREE[model], change)
+        scale, shift = float(to_full[0, 0]), np.asarray(to_full[:2, 2], np.float64)
+        full = full_size(a, b, fine if back is None else back @ fine)
+        return full, error.moved(scale, shift), bent.moved(scale, shift)
 
     def _scatter(
         self, patches: Shifts, corners: NDArray[np.float64], shape: tuple[int, int], model: Freedom
@@ -182,6 +173,13 @@ class Decide:
             reach=float(self.agree.reach),
             free=FREE[model],
         )
+
+
+def _to_similarity(b_H_a: Matrix, px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, 2) change at px (n, 2) of b from a transform to the similarity nearest to it there."""
+    px_a = transfer(np.asarray(np.linalg.inv(b_H_a), np.float64), px)
+    alike = fitted("similarity", px_a, px)
+    return np.zeros_like(px) if alike is None else transfer(alike, px_a) - px
 
 
 def _apply(matrix: NDArray[Any], px: NDArray[Any]) -> NDArray[Any]:

@@ -95,8 +95,9 @@ class StateError:
     weight: float = 3.0
     """See `least_px`."""
     lens: float = 0.02
-    """Prior of each parameter beyond a similarity where a picture was taken through a lens, at half
-    b's diagonal, as a share of that: distortion, and perspective by a tilt of some degrees.
+    """Prior of each parameter beyond a similarity where a picture was taken through a lens, at the
+    furthest corner of what both show, as a share of its distance from the middle: distortion, and
+    perspective by a tilt of some degrees.
     """
     version: ClassVar[int] = 5
 
@@ -118,32 +119,35 @@ class StateError:
     def bent(
         self,
         patches: Shifts,
+        scatter: Scatter,
         usual: NDArray[np.float64],
-        *,
-        centre: NDArray[np.float64],
-        unit: float,
+        corners: NDArray[np.float64],
         reach: float,
         apart: NDArray[np.float64],
     ) -> ErrorField:
         """The error over b, and how far it departs, where a picture was taken through a lens and
-        not quite from above: as the patches tell, and where there are none, by what lenses and tilts
-        usually do.
+        not quite from above: as the patches tell, and where there are none, by what lenses and
+        tilts usually do.
 
-        usual: (8,) parameters of `offsets` from the registration to the similarity nearest to it;
-        apart: (8,) as in `__call__`; the rest as in `scatter`.
+        scatter: of the registration; usual: (8,) its parameters from the registration to the
+        similarity nearest to it; corners: (n, 2) of what both pictures show; apart: (8,) as in
+        `__call__`; all in px of b.
         """
+        centre, unit = scatter.centre, scatter.unit
         J = offsets(patches.px, centre, unit, lens=True)
-        count = J.shape[2]
-        deviation = np.full(count, self.lens * unit)
-        deviation[: FREE["similarity"]] = _FLAT * unit
+        rim = float(np.linalg.norm(corners - centre, axis=1).max()) / unit
+        free, count = FREE["similarity"], J.shape[2]
+        powers = np.array([0.0] * 2 + [1] * 4 + [2] * 6 + [3])  # of the distance, by parameter
+        deviation = self.lens * unit * rim ** (1 - powers)
+        deviation[:free] *= _FLAT
         expected, more = np.zeros(count), np.zeros(count)
-        expected[FREE["similarity"] : 8], more[:8] = usual[FREE["similarity"] :], apart
+        expected[free:8], more[:8] = usual[free:], apart
         known = np.diag(1 / deviation**2)
-        scatter, found = self._separated(
+        own, found = self._separated(
             patches, J, lambda s: known * s**2, expected, centre=centre, unit=unit, reach=reach
         )
-        square = self._square(scatter)
-        covariance = np.linalg.inv(scatter.information / square + known)
+        square = self._square(own)
+        covariance = np.linalg.inv(own.information / square + known)
         return ErrorField(
             centre=centre,
             unit=unit,

@@ -2,7 +2,7 @@
 tolerated.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -14,6 +14,8 @@ from skyquilt.model.registration import RefusedRegistration, Registration
 
 TOLERANCE = 0.02
 """Largest tolerated error if none is given, as a share of b's diagonal."""
+LEAST_SHARE = 0.5
+"""Least share of what both show within the tolerance where a lens bends the rest."""
 _ACROSS = 96
 """Points along a's longer side at which the error is computed."""
 
@@ -66,11 +68,20 @@ def state_error(
 
 
 def tolerated(
-    outcome: Registration, stated: StatedError | None
+    outcome: Registration, stated: StatedError | None, *, bent: bool = False
 ) -> Registration | RefusedRegistration:
-    """The registration, or its refusal if its stated error is larger than tolerated."""
+    """The registration, or its refusal if its stated error is larger than tolerated; `bent`: a lens
+    bends the rim of a picture, so that a note tells it where the rest is within the tolerance.
+    """
     if stated is None or stated.error_px <= stated.tolerance_px:
         return outcome
+    if bent and stated.valid_share >= LEAST_SHARE:
+        note = (
+            "Lenses and tilts bend photos, and no transform follows that:"
+            f" {stated.valid_share:.0%} of the picture are within {stated.tolerance_px:.1f} px of"
+            f" B, a corner may be {stated.error_px:.0f} px off; --tolerance refuses that."
+        )
+        return replace(outcome, note=outcome.note or note)
     return RefusedRegistration(
         reason=f"the error may reach {stated.error_px:.1f} px in a corner of the picture, and"
         f" {stated.tolerance_px:.1f} px are tolerated: patches confirm the registration in a part"

@@ -120,7 +120,7 @@ def outcome_of(a: Source, b: Source, method: str, guess: Guess | None) -> Outcom
         return outcome
     full_a, full_b = a.full_S_picture, b.full_S_picture
     matrix = full_b @ outcome.b_H_a @ np.linalg.inv(full_a)
-    error = outcome.lens_error if a.through_lens or b.through_lens else outcome.error
+    error = outcome.lens_error if _through_lens(a, b) else outcome.error
     error = error and error.seen_in(full_b)
     if outcome.model == "similarity" and not _similar(matrix):
         outcome = replace(outcome, model="affine")  # of files whose pixels are longer than wide
@@ -158,7 +158,8 @@ def within_tolerance(
     if isinstance(outcome, RefusedRegistration):
         return outcome, None
     stated = state_error(outcome, (a.height, a.width), (b.height, b.width), tolerance_px)
-    return tolerated(outcome, stated), stated
+    bent = tolerance_px is None and _through_lens(a, b)
+    return tolerated(outcome, stated, bent=bent), stated
 
 
 def as_record(
@@ -247,6 +248,10 @@ def _told(
     return _Told(
         outcome=outcome, stated=stated, guess=guess, cpu_s=cpu_seconds() - since, beside_m=beside
     )
+
+
+def _through_lens(a: Source, b: Source) -> bool:
+    return a.through_lens or b.through_lens
 
 
 def _length(metres: float) -> str:
