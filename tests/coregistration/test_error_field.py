@@ -49,6 +49,59 @@ def test_offsets_are_the_derivatives_of_a_homography():
         assert moved == pytest.approx(small * offsets(px, FRAME["centre"], unit)[:, :, k], abs=1e-6)
 
 
+def test_a_lens_is_one_wherever_its_middle_lies():
+    """The third power of the distance from any place is a sum of these changes."""
+    px = patches(20, 250)
+    J = offsets(px, FRAME["centre"], FRAME["unit"], lens=True)
+    assert J.shape == (len(px), 2, 13) and np.linalg.matrix_rank(J.reshape(-1, 13)) == 13
+    assert (J[..., :8] == offsets(px, FRAME["centre"], FRAME["unit"])).all()
+    q = px - [60.0, 170.0]
+    shift = 1e-6 * q * (q**2).sum(1, keepdims=True)
+    told = np.linalg.lstsq(J.reshape(-1, 13), shift.ravel(), rcond=None)[0]
+    assert J @ told == pytest.approx(shift, abs=1e-9)
+
+
+def bent_by(lens_px, low, high):
+    """Patches of a picture whose corners a lens moves by so many px, about a place beside its
+    middle, and where its corners are then.
+    """
+
+    def moved(px):
+        q = (px - [140.0, 110.0]) / FRAME["unit"]
+        return lens_px * q * ((q**2).sum(1, keepdims=True) - 0.4)
+
+    px = np.concatenate([patches(low, high)] * 2)
+    shift = moved(px) + np.random.default_rng(8).normal(0, 0.4, px.shape)
+    return patched(px, shift), np.linalg.norm(moved(CORNERS), axis=1)
+
+
+@pytest.mark.parametrize("columns", [(20, 250), (20, 190), (60, 190)])
+def test_what_a_lens_bends_is_within_the_bound(columns):
+    """By up to 6 px at a corner, which a similarity cannot follow: also where no patches lie at
+    the rim.
+    """
+    told, actual = bent_by(9.0, *columns)
+    state = StateError()
+    scatter = state.scatter(told, free=4, **FRAME)
+    still = np.zeros(8)
+    bound = state.bent(told, scatter, still, CORNERS, FRAME["reach"], still).bound_px(CORNERS)
+    assert actual.max() > 1.5 * state(scatter, 4).bound_px(CORNERS).max()
+    assert (actual <= bound).all() and bound.max() < 2.5 * actual.max()
+
+
+def test_without_patches_lenses_bend_as_they_usually_do():
+    """Two shifts in the middle tell nothing of the corners: the bound is that of the prior."""
+    px = np.array([[120.0, 127.5], [135.0, 127.5]])
+    told, state = patched(np.repeat(px, 12, 0), np.zeros((24, 2))), StateError()
+    scatter = state.scatter(told, free=4, **FRAME)
+    for times in (1, 2):
+        corners = FRAME["centre"] + times * (CORNERS - FRAME["centre"])
+        none = np.zeros(8)
+        bound = state.bent(told, scatter, none, corners, FRAME["reach"], none).bound_px(corners)
+        rim = times * 127.5 * np.sqrt(2)
+        assert (bound > 2.4 * state.lens * rim).all()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["similarity", "homography"])
 def test_bounds_hold_for_drawn_errors(model):
@@ -198,6 +251,20 @@ def test_what_is_stated_and_tolerated():
     assert state_error(found, shape, shape, None).tolerance_px == pytest.approx(
         TOLERANCE * np.hypot(*shape)
     )
+
+
+def test_a_lens_may_bend_a_part_of_the_picture():
+    """Where most is within the tolerance, a note tells the rest; a stated tolerance, or too small a
+    part, refuses it.
+    """
+    shape, found = (100, 300), growing()
+    said = state_error(found, shape, shape, 10.0)
+    kept = tolerated(found, said, bent=True)
+    assert isinstance(kept, Registration) and 0.5 < said.valid_share < 0.8
+    assert f"{said.valid_share:.0%} of the picture are within 10.0 px" in kept.note
+    assert "a corner may be 15 px off" in kept.note
+    assert isinstance(tolerated(found, said), RefusedRegistration)
+    assert not tolerated(found, state_error(found, shape, shape, 5.0), bent=True)
 
 
 def test_the_map_agrees_with_the_bounds():

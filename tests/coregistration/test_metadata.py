@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skyquilt.coregistration.pictures import from_metadata
+from skyquilt.coregistration.pictures import from_metadata, of_photo
 from skyquilt.model.photo import Attitude, Focal, GeoPosition, Photo
 
 LATITUDE, LONGITUDE = 46.5, -92.0
@@ -72,3 +72,11 @@ def test_what_is_not_stated_is_taken_as_equal():
 def test_guessed_focal_lengths_and_photos_far_apart_say_nothing():
     assert from_metadata(photo(*A, source="guess"), photo(*B)) is None
     assert from_metadata(photo(*A), photo(400.0, *B[1:])) is None
+
+
+def test_a_camera_is_known_by_its_focal_length():
+    """A picture without one may be a map, or of a camera whose lens was taken out of it."""
+    told, guessed = photo(*A), photo(*A, source="guess")
+    values = np.zeros((750, 1000), np.uint8)
+    assert of_photo(told, values).through_lens and not of_photo(guessed, values).through_lens
+    assert of_photo(replace(guessed, unit="degC"), values).through_lens
