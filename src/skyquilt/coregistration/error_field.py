@@ -94,10 +94,14 @@ class StateError:
     """Scatter expected without any patch, px; it counts as much as `weight` observations."""
     weight: float = 3.0
     """See `least_px`."""
-    lens: float = 0.02
+    lens: float = 0.03
     """Prior of each parameter beyond a similarity where a picture was taken through a lens, at the
     furthest corner of what both show, as a share of its distance from the middle: distortion, and
     perspective by a tilt of some degrees.
+    """
+    alike: float = 10.0
+    """`dependence` where a lens is fitted, too: relief bends patches alike over large parts of the
+    picture.
     """
     version: ClassVar[int] = 5
 
@@ -146,7 +150,7 @@ class StateError:
         own, found = self._separated(
             patches, J, lambda s: known * s**2, expected, centre=centre, unit=unit, reach=reach
         )
-        square = self._square(own)
+        square = self._square(own) * self.alike / self.dependence
         covariance = np.linalg.inv(own.information / square + known)
         return ErrorField(
             centre=centre,
