@@ -38,7 +38,7 @@ def command(
         typer.Option(
             help="Largest error in px of B that is tolerated over the picture: a registration that"
             " may be further off in a corner (95 %) is refused. For auto, structure, shapes and"
-            " rfae-refined. Default: 2 % of B's diagonal."
+            " rfae-refined. Default: 2 % of B's diagonal, for photos of a camera over half of it."
         ),
     ] = None,
     overwrite: Overwrite = False,
