@@ -71,7 +71,7 @@ class Decide:
     """Weight of finer structure, the rest is that of coarser one. Alone it is the more exact where
     the bands are alike, and the less exact where they are not, and its error is less certain.
     """
-    version: ClassVar[int] = 8
+    version: ClassVar[int] = 9
 
     def __call__(
         self,
