@@ -11,7 +11,14 @@ from scipy.optimize import approx_fprime
 from skyquilt.alignment.control import fit_similarity_3d
 from skyquilt.alignment.problem import CAMERA
 from skyquilt.alignment.robust import prior_terms
-from skyquilt.alignment.same_lens import DEVIATION, as_of_sizes, lenses_of_sizes, same_lens, unlike
+from skyquilt.alignment.same_lens import (
+    DEVIATION,
+    MOST_SIZES,
+    as_of_sizes,
+    lenses_of_sizes,
+    same_lens,
+    unlike,
+)
 from skyquilt.model.camera import PARAMETERS
 from skyquilt.model.photo import Zoom
 from tests.alignment.blocks import FOCAL, HEIGHT, LENS, WIDTH, make_block
@@ -136,6 +143,12 @@ def test_sizes_that_are_parts_count_as_they_are():
 def test_one_size_is_no_lens_of_several_nor_are_upright_pictures_of_wide_ones():
     upright = replace(sized("b", 1.0), width=HEIGHT, height=WIDTH, camera_key="cam 600x800 4.0mm")
     assert lenses_of_sizes([sized("a", 1.0), upright, sized("c", 1.0, zoom=2.0)]) == {}
+
+
+def test_hundreds_of_sizes_are_left_as_they_are():
+    many = [sized(f"{k}", 1.0 - k / 1000) for k in range(MOST_SIZES + 1)]
+    assert lenses_of_sizes(many) == {}
+    assert len(lenses_of_sizes(many[1:])) == MOST_SIZES
 
 
 def test_metadata_of_the_most_frequent_size_are_believed_once():
