@@ -1,16 +1,16 @@
 """Which photos of two cameras belong together where one is released later, or its clock is off."""
 
 from dataclasses import replace
-from datetime import datetime, timedelta
-from pathlib import Path
+from datetime import timedelta
 
 import numpy as np
 import pytest
 
-from skyquilt.model.photo import Focal, GeoPosition, Photo
+from skyquilt.model.photo import GeoPosition
 from skyquilt.thermal.partners import partners
+from tests.photos.test_together import NOON
+from tests.photos.test_together import photo as taken
 
-NOON = datetime(2024, 6, 1, 12)
 SPEED, GAP_S, TURN_S = 6.0, 2.3, 9.0
 
 
@@ -36,21 +36,7 @@ def photo(name, seconds, place, camera="a"):
         position = GeoPosition(
             latitude_deg=north, longitude_deg=east, altitude_m=60, datum="takeoff"
         )
-    return Photo(
-        name=name,
-        path=Path(name),
-        digest=name,
-        width=640,
-        height=512,
-        channels=1,
-        dtype="uint8",
-        band="visible",
-        camera_key=camera,
-        focal=Focal(px=700, sigma_px=70, source="guess"),
-        position=position,
-        attitude=None,
-        time=NOON + timedelta(seconds=float(seconds)),
-    )
+    return replace(taken(name, float(seconds)), position=position, camera_key=camera)
 
 
 def flown(delay_s=1.0, clock_s=0.0, scatter_s=0.0, noise_m=1.0, placed=True, lost=(), first=500):
