@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from skyquilt.errors import SideFileError
+from skyquilt.geometry.frames import METRES_PER_DEGREE
 from skyquilt.photos.side_files import apply_positions
-from skyquilt.video.positions import METRES_PER_DEGREE
 from tests.alignment.surveys import photo
 
 BEGIN = datetime(2024, 7, 15, 8, 30, tzinfo=UTC)

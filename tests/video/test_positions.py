@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from skyquilt.errors import SideFileError
+from skyquilt.geometry.frames import METRES_PER_DEGREE
 from skyquilt.model.clip import Looks
 from skyquilt.video.clock import OffsetSearch
 from skyquilt.video.fixes import Fix, track_of
-from skyquilt.video.positions import METRES_PER_DEGREE, places_at, position_at
+from skyquilt.video.positions import places_at, position_at
 from skyquilt.video.read import read_clip
 from skyquilt.video.tracks import read_track
 from skyquilt.workflows.clip_frames import FrameMethods, timed

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from skyquilt.coregistration.candidates import middle, similarity
 from skyquilt.coregistration.places import Lies, map_in_map, photo_in_map, shared_boxes
 from skyquilt.errors import SideFileError, UnreadablePhotoError, UsageError
+from skyquilt.geometry.frames import east_north_m
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.registration import Guess, Matrix, Picture
 from skyquilt.photos.pixels import read_color
@@ -23,7 +24,6 @@ from skyquilt.photos.read import read_photo
 from skyquilt.raster.drivers import NO_TEXT, is_text
 from skyquilt.raster.read_map import MapFile, open_map, read_part, read_window
 
-_EARTH_M = 6378137.0
 _REACH = 0.3
 """Largest error from tilt, lever arms and positions, as a share of b's longer side."""
 _TURN_DEG = 12.0
@@ -78,9 +78,7 @@ def _heights(a: Photo, b: Photo) -> tuple[float, float] | None:
 def _shift(a: Photo, b: Photo, yaw_b_deg: float) -> np.ndarray:
     """(2,) m from b's camera to a's, along b's image: x right, y down."""
     assert a.position is not None and b.position is not None
-    north = radians(a.position.latitude_deg - b.position.latitude_deg) * _EARTH_M
-    east = radians(a.position.longitude_deg - b.position.longitude_deg) * _EARTH_M
-    east *= cos(radians(b.position.latitude_deg))
+    east, north = east_north_m(b.position, a.position)
     yaw = radians(yaw_b_deg)
     right, up = east * cos(yaw) - north * sin(yaw), east * sin(yaw) + north * cos(yaw)
     return np.array([right, -up])

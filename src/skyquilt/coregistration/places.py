@@ -1,19 +1,17 @@
 """Where one file lies in another by what both say of their places on the ground."""
 
 from dataclasses import dataclass
-from math import cos, radians
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.geometry.frames import ned_from_body
+from skyquilt.geometry.frames import beside_deg, ned_from_body
 from skyquilt.geometry.transforms import fit, transfer
 from skyquilt.model.photo import Photo
 from skyquilt.model.registration import Matrix
 from skyquilt.raster.read_map import Box, MapFile, part_between
 
-_EARTH_M = 6378137.0
 _SHARE = 0.1
 """Largest error of the places of two maps, as a share of the smaller one's longer side, ..."""
 _POSITIONS_M = 6.0
@@ -80,10 +78,13 @@ def photo_in_map(photo: Photo, target: MapFile, off: float) -> Lies | None:
     north, east, down = ned_from_body(angles.yaw_deg, angles.pitch_deg, angles.roll_deg) @ rays
     if (down < 0.1).any():
         return None
-    latitude = position.latitude_deg + np.degrees(height * north / down / _EARTH_M)
-    per = _EARTH_M * cos(radians(position.latitude_deg))
-    longitude = position.longitude_deg + np.degrees(height * east / down / per)
-    there = _places(target, np.asarray(longitude), np.asarray(latitude), "EPSG:4326")
+    latitude, longitude = beside_deg(
+        position.latitude_deg,
+        position.longitude_deg,
+        east_m=height * east / down,
+        north_m=height * north / down,
+    )
+    there = _places(target, longitude, latitude, "EPSG:4326")
     if there is None or box(there, 0.0, (target.width, target.height)) is None:
         return None
     found = fit("homography", px, there)

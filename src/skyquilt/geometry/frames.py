@@ -7,15 +7,39 @@ visually.
 """
 
 from collections.abc import Sequence
-from typing import overload
+from typing import TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.model.photo import GeoPosition
+
 Matrix = NDArray[np.float64]
+Metres = TypeVar("Metres", float, Matrix)
 
 MAP_R_NED: Matrix = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 CAM_R_BODY: Matrix = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+METRES_PER_DEGREE = 111_320.0
+"""Length in m of a degree of latitude, and of longitude at the equator, on a sphere of WGS 84's
+larger radius; up to 0.7 % too long. What must be exact is projected.
+"""
+
+
+def east_north_m(origin: GeoPosition, place: GeoPosition) -> tuple[float, float]:
+    """How far in m one position lies to the east and north of another near it."""
+    north = (place.latitude_deg - origin.latitude_deg) * METRES_PER_DEGREE
+    shrink = np.cos(np.radians(origin.latitude_deg))
+    east = (place.longitude_deg - origin.longitude_deg) * METRES_PER_DEGREE * shrink
+    return float(east), float(north)
+
+
+def beside_deg(
+    latitude_deg: float, longitude_deg: float, *, east_m: Metres, north_m: Metres
+) -> tuple[Metres, Metres]:
+    """Latitude and longitude in degrees of what lies so far in m to the east and north."""
+    shrink = max(float(np.cos(np.radians(latitude_deg))), 1e-6)
+    latitude = latitude_deg + north_m / METRES_PER_DEGREE
+    return latitude, longitude_deg + east_m / (METRES_PER_DEGREE * shrink)
 
 
 def _euler_zyx(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Matrix:

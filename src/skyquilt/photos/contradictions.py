@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from skyquilt.geometry.frames import angle_difference_deg
+from skyquilt.geometry.frames import angle_difference_deg, east_north_m
 from skyquilt.model.photo import GeoPosition, Photo
 from skyquilt.photos.side_rows import sentence_of
 
@@ -14,7 +14,6 @@ _NADIR_DEG = 30.0
 _ALTITUDE_APART_M = 10.0
 _ALTITUDE_RANGE_M = 40.0
 _SHORT_MOVE_M = 3.0
-_METRES_PER_DEGREE = 111_320.0
 
 
 def contradictions(photos: Sequence[Photo]) -> tuple[str, ...]:
@@ -76,12 +75,7 @@ def _camera_yaw(photo: Photo) -> float | None:
 def _track_deg(a: GeoPosition | None, b: GeoPosition | None) -> float | None:
     if a is None or b is None:
         return None
-    north = (b.latitude_deg - a.latitude_deg) * _METRES_PER_DEGREE
-    east = (
-        (b.longitude_deg - a.longitude_deg)
-        * _METRES_PER_DEGREE
-        * np.cos(np.radians(a.latitude_deg))
-    )
+    east, north = east_north_m(a, b)
     return (
         float(np.degrees(np.arctan2(east, north)))
         if np.hypot(north, east) > _SHORT_MOVE_M

@@ -12,13 +12,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.geometry.frames import METRES_PER_DEGREE
 from skyquilt.model.photo import Datum, Photo
 from skyquilt.photos.side_rows import sentence_of
 from skyquilt.photos.tags import NO_FIX, NO_HEIGHT
 from skyquilt.photos.unmeasured import flat, void
 
 Array = NDArray[np.float64]
-_METRES_PER_DEGREE = 111_320.0
 FAR_M = 5_000.0
 FAR_STEPS = 20.0
 """A gap is longer than FAR_M and longer than so many times the way from a photo to the nearest."""
@@ -34,7 +34,7 @@ _EXCHANGED: dict[str, Callable[[float, float], tuple[float, float]]] = {
     "north and south, east and west": lambda north, east: (-north, -east),
     "latitude and longitude": lambda north, east: (east, north),
 }
-_EARTH_M = _METRES_PER_DEGREE * 180 / np.pi
+_EARTH_M = METRES_PER_DEGREE * 180 / np.pi
 _Name = Literal["sea_level_m", "ellipsoid_m"]
 _ZEROS: tuple[tuple[_Name, str], ...] = (
     ("sea_level_m", "sea level"),
@@ -316,7 +316,7 @@ def _rounded(photos: Sequence[Photo]) -> tuple[list[Photo], str]:
     degrees = _degrees(photos)
     for step in _STEPS_DEG if len(photos) >= _ROUNDED_PHOTOS else ():
         if (np.abs(degrees - step * np.round(degrees / step)) < _EXACT_DEG).all():
-            metres = step * _METRES_PER_DEGREE
+            metres = step * METRES_PER_DEGREE
             sigma = metres / np.sqrt(12)  # of a uniform distribution
             note = (
                 f"have positions that are rounded to {metres:.0f} m; they count as uncertain by"

@@ -5,11 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from skyquilt.geometry.frames import ned_from_body
+from skyquilt.geometry.frames import beside_deg, ned_from_body
 from skyquilt.model.photo import GeoPosition, Photo
 from skyquilt.photos.side_rows import sentence_of
-
-_METRES_PER_DEGREE = 111_320.0
 
 
 def with_lever_arm(
@@ -42,7 +40,6 @@ def with_lever_arm(
 
 def _shifted(position: GeoPosition, north: float, east: float, down: float) -> GeoPosition:
     """A position moved by m to the north, east and down."""
-    shrink = max(float(np.cos(np.radians(position.latitude_deg))), 1e-6)
     heights = {
         name: height - down
         for name in ("altitude_m", "takeoff_m", "sea_level_m", "ellipsoid_m")
@@ -50,9 +47,7 @@ def _shifted(position: GeoPosition, north: float, east: float, down: float) -> G
     }
     if position.datum == "takeoff":
         heights.pop("altitude_m", None)  # a barometer's zero has the same arm
-    return replace(
-        position,
-        latitude_deg=position.latitude_deg + north / _METRES_PER_DEGREE,
-        longitude_deg=position.longitude_deg + east / (_METRES_PER_DEGREE * shrink),
-        **heights,
+    latitude, longitude = beside_deg(
+        position.latitude_deg, position.longitude_deg, east_m=east, north_m=north
     )
+    return replace(position, latitude_deg=latitude, longitude_deg=longitude, **heights)

@@ -1,6 +1,5 @@
 """Positions from side files: CSV, OpenDroneMap's geo.txt, DJI's MRK; SRT has its own module."""
 
-import math
 import os
 import re
 from collections.abc import Collection, Sequence
@@ -9,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from skyquilt.errors import SideFileError
+from skyquilt.geometry.frames import beside_deg
 from skyquilt.model.photo import Datum, Photo
 from skyquilt.outside import plain
 from skyquilt.photos.pos_events import read_pos
@@ -186,7 +186,6 @@ _LINE = re.compile(
 )
 _SHOT = re.compile(r"^DJI_[0-9]{12,14}_([0-9]{4,6})(?=_|$)|_([0-9]{4,18})(?:_[A-Za-z]+)?$")
 """The number of a shot in a photo's name; behind it may stand the lens, and words of a mission."""
-_METRES_PER_DEGREE = 111_320.0
 
 
 def read_mrk(
@@ -231,12 +230,14 @@ def _index(name: str) -> int:
 def _mrk_row(name: str, shot: list[float | None]) -> SideRow:
     north, east, down, lat, lon, height, *sigmas = shot
     latitude, longitude = lat or 0.0, lon or 0.0
-    shrink = math.cos(math.radians(latitude))
+    latitude, longitude = beside_deg(
+        latitude, longitude, east_m=(east or 0.0) / 1000, north_m=(north or 0.0) / 1000
+    )
     plane = [s for s in sigmas[:2] if s]
     return SideRow(
         name=name,
-        latitude_deg=latitude + (north or 0.0) / 1000 / _METRES_PER_DEGREE,
-        longitude_deg=longitude + (east or 0.0) / 1000 / (_METRES_PER_DEGREE * max(shrink, 1e-6)),
+        latitude_deg=latitude,
+        longitude_deg=longitude,
         altitude_m=(height or 0.0) - (down or 0.0) / 1000,
         datum="ellipsoid",
         sigma_xy_m=max(plane) if plane else None,

@@ -8,6 +8,7 @@ from pathlib import PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.geometry.frames import east_north_m
 from skyquilt.model.photo import Photo
 
 SECONDS = 0.75
@@ -18,7 +19,6 @@ rounded to seconds, or a camera may write late.
 """
 APART_M = 5.0
 """Distance between reported positions above which two photos are not from the same drone."""
-_EARTH_M = 6371008.8
 
 
 def taken_together(a: Sequence[Photo], b: Sequence[Photo]) -> list[tuple[int, int]]:
@@ -125,8 +125,4 @@ def _possible(a: Photo, b: Photo) -> bool:
         return False
     if a.position is None or b.position is None:
         return True
-    north = np.radians(a.position.latitude_deg - b.position.latitude_deg)
-    east = np.radians(a.position.longitude_deg - b.position.longitude_deg) * np.cos(
-        np.radians(a.position.latitude_deg)
-    )
-    return bool(np.hypot(north, east) * _EARTH_M < APART_M)
+    return bool(np.hypot(*east_north_m(a.position, b.position)) < APART_M)

@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.errors import SideFileError
+from skyquilt.geometry.frames import METRES_PER_DEGREE
 from skyquilt.model.clip import Track
 from skyquilt.model.photo import Photo
 from skyquilt.photos.position_tables import has_header
 from skyquilt.photos.side_rows import SideRow, sentence_of
 from skyquilt.photos.together import whole_seconds
-from skyquilt.video.positions import METRES_PER_DEGREE, places_at, position_at
+from skyquilt.video.positions import places_at, position_at
 from skyquilt.video.tracks import is_timed_csv, read_track, unix_s
 
 Array = NDArray[np.float64]

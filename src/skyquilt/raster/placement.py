@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from skyquilt.geometry.frames import METRES_PER_DEGREE
 from skyquilt.outside import open_regular
 
 if TYPE_CHECKING:
@@ -15,8 +16,6 @@ if TYPE_CHECKING:
 _MOST_OFF = 0.5
 """Largest distance in px of control points from the plane placement that stands for them."""
 _LEAST_POINTS = 3
-_DEGREE_M = 111_195.0
-"""A degree along a meridian."""
 _MOST_PRJ = 100_000
 """Bytes of a .prj file."""
 
@@ -103,4 +102,4 @@ def metres_per_unit(crs: str | None, y: float) -> tuple[float, float] | None:
         return None
     if kind:
         return kind, kind
-    return _DEGREE_M * max(float(np.cos(np.radians(y))), 1e-3), _DEGREE_M
+    return METRES_PER_DEGREE * max(float(np.cos(np.radians(y))), 1e-3), METRES_PER_DEGREE

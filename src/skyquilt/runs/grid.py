@@ -6,13 +6,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from skyquilt.errors import UsageError
+from skyquilt.geometry.frames import METRES_PER_DEGREE
 from skyquilt.raster.map_source import Bounds, MapSource, between
 
 if TYPE_CHECKING:
     from pyproj import CRS
 
-METRES_PER_DEGREE = 111_320.0
-"""Length of a degree of latitude."""
 MOST_PIXELS = 20_000_000_000
 """Largest export in pixels."""
 BLOCK = 2048

@@ -12,10 +12,11 @@ from xml.sax.saxutils import escape
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.geometry.frames import METRES_PER_DEGREE
 from skyquilt.raster.atomic import whole_file
 from skyquilt.raster.map_source import Bounds, FileSource, between, picture
 from skyquilt.raster.picture_files import image_bytes
-from skyquilt.runs.grid import METRES_PER_DEGREE, ExportGrid
+from skyquilt.runs.grid import ExportGrid
 from skyquilt.runs.layers import RunLayer
 
 SIDE = 512

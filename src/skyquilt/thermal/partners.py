@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.motion import velocities
+from skyquilt.geometry.frames import east_north_m
 from skyquilt.model.photo import Photo, RejectedPhoto, evenly
 from skyquilt.photos.together import APART_M, SECONDS, clocks, taken_together, whole_seconds
 
@@ -30,7 +31,6 @@ _TRIED = 40
 """Most differences of clocks that are tried."""
 _BIAS_M, _SCATTER_M = 2.0, 2.0
 """Standard deviations in m of the distance that two receivers are apart, and of its changes."""
-_EARTH_M = 6371008.8
 _FEW = 0.2
 """Share of the thermal photos up to which those of another camera or format are exceptions."""
 _ANOTHER = "it is of another camera or format than most of the thermal photos"
@@ -160,17 +160,10 @@ def _places(
     told = [np.mean([p.position is not None for p in own]) for own in (a, b)]
     if min(told) < _LEAST:
         return None
-    origin = np.radians([known[0].latitude_deg, known[0].longitude_deg])
-    scale = _EARTH_M * np.array([np.cos(origin[0]), 1.0])
     of_a, of_b = (
         np.array(
             [
-                (np.nan, np.nan)
-                if p.position is None
-                else (
-                    np.radians([p.position.longitude_deg, p.position.latitude_deg]) - origin[::-1]
-                )
-                * scale
+                (np.nan, np.nan) if p.position is None else east_north_m(known[0], p.position)
                 for p in own
             ]
         )

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.geometry.frames import METRES_PER_DEGREE
 from skyquilt.model.clip import Looks, Track
-from skyquilt.video.positions import METRES_PER_DEGREE, places_at
+from skyquilt.video.positions import places_at
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

@@ -6,12 +6,11 @@ from datetime import UTC, datetime
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.geometry.frames import belly_from_gimbal
+from skyquilt.geometry.frames import METRES_PER_DEGREE, belly_from_gimbal
 from skyquilt.model.clip import Clip, Track
 from skyquilt.model.photo import Attitude, Datum, GeoPosition
 
 Array = NDArray[np.float64]
-METRES_PER_DEGREE = 111_320.0
 _ACCELERATION = 1.5
 """Standard deviation of a drone's acceleration in m/s^2."""
 _COARSE_DEG = 0.9e-5
