@@ -324,7 +324,7 @@ def test_worth_a_look_names_what_is_worst_and_nothing_where_all_is_well():
     starts = [
         "Poor overlap: 40%", "Photos disagree at the seams by 6.1 px",
         "Few seams measured: 30 of 100",
-        "Shutter not modelled: that of a", "Shutter not modelled: nothing says how b",
+        "Shutter not modelled: nothing says how b exposes.", "Shutter not modelled: that of a",
         "Thermal values are sensor counts", "The flight does not determine the focal length",
         "1 metadata conflict (yaw)",
     ]  # fmt: skip
@@ -333,6 +333,24 @@ def test_worth_a_look_names_what_is_worst_and_nothing_where_all_is_well():
         assert words.startswith(start), words
     page = Page(build_report(run(metrics=metrics, views=views)))
     assert "the compass is off" in page.text  # the cause as metrics.json gives it
+
+
+def test_sizes_of_one_camera_are_told_in_one_sentence_about_shutters():
+    unknown = {"source": "unknown", "readout_ms": 0.0, "largest_displacement_px": 0.0}
+    still = {"source": "table", "largest_displacement_px": 0.0}
+    shutter = {
+        **{f"camera {n}": unknown for n in range(30)},
+        **{f"slow {n}": {**still, "readout_ms": 33.0} for n in range(2)},
+        "fast": {**still, "readout_ms": 8.0},
+    }
+    metrics = {"photos_used": 9, "photos_total": 9, "blocks": [9], "shutter": shutter}
+    told = [w for w in attended(metrics=metrics) if w.startswith("Shutter not modelled")]
+    assert [words.split(":")[1][:40] for words in told] == [
+        " nothing says how camera 0, camera 1, ca",
+        " that of slow 0, slow 1 is rolling (33 m",
+        " that of fast is rolling (8 ms), and not",
+    ]
+    assert "more expose. If their shutter is rolling" in told[0] and len(told[0]) < 400, told
 
 
 def test_a_guessed_readout_is_told_beside_what_was_found_and_not_where_it_moves_nothing():

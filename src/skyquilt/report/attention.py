@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from skyquilt.alignment.outcome import UNDETERMINED, UNSETTLED
+from skyquilt.photos.side_rows import sentence_of
 from skyquilt.report import headline
 from skyquilt.report.input import ReportInput
 from skyquilt.report.numbers import count, fixed, items, mapping, number, plain
@@ -82,31 +83,39 @@ def _seams(m: Mapping[str, Any]) -> Iterator[Sentence]:
 
 
 def _shutter(m: Mapping[str, Any]) -> Iterator[Sentence]:
-    """Rolling shutters whose effect is not, or hardly, known."""
+    """Rolling shutters whose effect is not, or hardly, known: cameras of one kind in one sentence,
+    since each size of photos is a camera.
+    """
+    untold, unmoved, guessed = list[str](), dict[str, list[str]](), list[str]()
     for camera, entry in mapping(m.get("shutter")).items():
         told = mapping(entry)
         readout, source = number(told.get("readout_ms")) or 0.0, told.get("source")
         moved = number(told.get("largest_displacement_px")) or 0.0
         if source == "unknown":
-            yield (
-                f"Shutter not modelled: nothing says how {plain(camera)} exposes. If its shutter"
-                " is rolling, give --shutter rolling and --shutter-readout.",
-                "cameras",
-            )
+            untold.append(plain(camera))
         elif readout >= LEAST_MS and moved == 0:
-            yield (
-                f"Shutter not modelled: that of {plain(camera)} is rolling"
-                f" ({fixed(readout, 0)} ms), and nothing tells how fast it moved.",
-                "cameras",
-            )
+            unmoved.setdefault(fixed(readout, 0), []).append(plain(camera))
         elif source == "guess" and moved >= LEAST_PX:
-            yield (
+            guessed.append(
                 f"Nothing tells the readout of {plain(camera)}, whose shutter is rolling: a guess"
                 f" of {fixed(told.get('prior_ms'), 0)} ms was adjusted to {fixed(readout, 1)}"
                 f" \u00b1 {fixed(told.get('sigma_ms'), 1)} ms, which moves places by up to"
-                f" {fixed(moved, 1)} px; --shutter-readout if you know better.",
-                "cameras",
+                f" {fixed(moved, 1)} px; --shutter-readout if you know better."
             )
+    if untold:
+        yield (
+            f"Shutter not modelled: nothing says how {sentence_of(untold)}"
+            f" {'expose. If their' if len(untold) > 1 else 'exposes. If its'} shutter is rolling,"
+            " give --shutter rolling and --shutter-readout.",
+            "cameras",
+        )
+    for ms, cameras in unmoved.items():
+        yield (
+            f"Shutter not modelled: that of {sentence_of(cameras)} is rolling ({ms} ms), and"
+            f" nothing tells how fast {'they' if len(cameras) > 1 else 'it'} moved.",
+            "cameras",
+        )
+    yield from ((text, "cameras") for text in guessed)
 
 
 def _counts(m: Mapping[str, Any]) -> Iterator[Sentence]:
