@@ -14,13 +14,13 @@ from skyquilt.live.adjustment_schedule import KEY as SCHEDULE
 from skyquilt.live.drone_metadata import Metadata
 from skyquilt.live.events import MapEvents, Update
 from skyquilt.live.ledger import hit
-from skyquilt.live.members import FAR_M, MOST_M, Member, Queues, about_record
+from skyquilt.live.members import FAR_M, GROUNDED, MOST_M, Member, Queues, about_record
 from skyquilt.live.photo_intake import BAND, OTHER_BAND, of_other_band
 from skyquilt.live.redraw_queue import RedrawQueue
 from skyquilt.model.photo import Photo
 from skyquilt.ortho.ground import round_gsd
 from skyquilt.outside import real, whole
-from skyquilt.photos.implausible_positions import on_sphere
+from skyquilt.photos.implausible_positions import on_sphere, raised
 
 FEW = 10
 """A map with at most so many photos is begun again where more of them lie elsewhere."""
@@ -69,6 +69,7 @@ class InitialPose:
         self.redraw, self.map_events, self.queues = redraw, map_events, queues
         self.members, self.canvas = metadata.members, redraw.canvas
         self.ledger = metadata.members.ledger
+        self._raised = set[str]()
 
     def place(self, member: Member) -> Update:
         """Places the photo, which is the first in the queue of received photos."""
@@ -79,10 +80,16 @@ class InitialPose:
             self._begin(first, warning)
         why = self.members.far_note(member.photo)
         previews = self._previews(member)
-        known = next((m.pose for m in reversed(previews) if m.pose is not None), None)
-        pose = known if known is not None else self.metadata.first(member)
+        pose = known = next((m.pose for m in reversed(previews) if m.pose is not None), None)
+        if known is None and self.members.on_ground(member):
+            why = GROUNDED
+        elif known is None:
+            pose = self.metadata.first(member)
+        grounded = self._grounded(member)
         self.pixels(member.id)
         with self.ledger.change():
+            for other in grounded:
+                self._off(other, keep=True, reason=GROUNDED)
             member.pose, member.state = pose, "waiting" if pose is None else "placed"
             self.members.save(member, reason=why)
             if self.members.frame is None and not self.ledger.meta(NO_PLACE):
@@ -95,8 +102,9 @@ class InitialPose:
                 self.map_events.superseded(preview)
             self.map_events.photo(member, **({"reason": why} if why else {}))
         hit("photo placed")
-        for preview in previews:
-            self.redraw.gone(preview.id)
+        for gone in (*previews, *grounded):
+            self.redraw.gone(gone.id)
+        self.queues.lost += [m for m in grounded if m.tried]
         self.queues.received.popleft()
         self.queues.untried.append(member)
         if pose is not None:
@@ -106,6 +114,20 @@ class InitialPose:
             else:
                 self.redraw.show(member)
         return Update(what=member.state, photo=member.id, text=warning or why)
+
+    def _grounded(self, member: Member) -> list[Member]:
+        """Photos of the same camera that are drawn as if from the air, being linked with none, and
+        prove to have been taken on the ground, since this one was not.
+        """
+        camera = member.photo.camera_key
+        if not raised(member.photo) or camera in self._raised:
+            return []
+        self._raised.add(camera)
+        return [
+            m
+            for m in self.members.on_map()
+            if m.state == "placed" and m.photo.camera_key == camera and self.members.on_ground(m)
+        ]
 
     def elsewhere(self, member: Member) -> bool:
         """Whether the map began in the wrong place, with a photo that was left on the card, say:
@@ -225,16 +247,17 @@ class InitialPose:
             for m in self.members.by_id.values():
                 self._off(m, keep=keep)
 
-    def _off(self, member: Member, *, keep: bool) -> None:
+    def _off(self, member: Member, *, keep: bool, reason: str = "") -> None:
         """Takes a photo off the map (inside a transaction); with `keep` it stays compared."""
         placed = member.state != "received"  # others still know the previews that they replace
         if member.state in ("placed", "refined", "waiting"):
             member.state = "waiting" if keep else "received"
-            self.map_events.photo(member, ring=[], at=None)
+            said = {"reason": reason} if reason else {}
+            self.map_events.photo(member, ring=[], at=None, **said)
         if member.state in ("received", "superseded", "waiting"):
             member.pose, member.camera, member.learned = None, "", None
             about = {"about": about_record(member, "") if keep else {}} if placed else {}
-            self.members.save(member, footprint="", reason="", **about)
+            self.members.save(member, footprint="", reason=reason, **about)
 
     def _previews(self, member: Member) -> list[Member]:
         """What arrived of the same shot before this photo and gives way to it, the oldest first:

@@ -24,12 +24,13 @@ from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.poses import MapFrame, Motion, Pose, Prior
 from skyquilt.outside import real, whole
 from skyquilt.photos.capture import stated_shutter
-from skyquilt.photos.implausible_positions import on_sphere, sphere, with_coarse_deviations
+from skyquilt.photos.implausible_positions import on_sphere, raised, sphere, with_coarse_deviations
 from skyquilt.photos.read import read_photo
 from skyquilt.photos.survey import capture_order
 
 FISHEYES = "fisheyes"
 """Name in the ledger of the cameras that proved to have a fisheye."""
+GROUNDED = "it was taken on the ground, as its height above take-off tells"
 MOST_M = 1e9
 """Largest coordinate in the map's frame."""
 FAR_M = 100_000.0
@@ -186,6 +187,13 @@ class Members:
         if self.distance_m(photo) > FAR_M:
             photo = replace(photo, position=None)
         return photo_prior(photo, self.frame, self._to_map)
+
+    def on_ground(self, member: Member) -> bool:
+        """Whether a photo was taken on the ground: its height above take-off, which is believed
+        since photos of its camera tell others, tells so.
+        """
+        photo = self._heights.doubted(member.id, member.photo)
+        return photo.above_takeoff_m is not None and not raised(photo)
 
     def _note_near(self, member: Member) -> None:
         if member.photo.position is not None and self.distance_m(member.photo) <= FAR_M:

@@ -164,6 +164,8 @@ class RedrawQueue:
     def gone(self, number: int) -> None:
         """Removes a photo."""
         self.held.discard(number)
+        for known in (self.pending, self._drawn, self._rims):
+            known.pop(number, None)
         _add(self.dirty, self.canvas.remove(number), number)
 
     def clear(self) -> None:

@@ -15,7 +15,7 @@ from skyquilt.live.ledger import hit
 from skyquilt.live.links import link_bytes
 from skyquilt.live.local_pose import Change, LocalPose
 from skyquilt.live.loose import is_loose
-from skyquilt.live.members import Member, Queues, about_record
+from skyquilt.live.members import GROUNDED, Member, Queues, about_record
 from skyquilt.live.redraw_queue import RedrawQueue
 from skyquilt.live.settings import WHOLE
 from skyquilt.live.thermal_notes import ThermalNotes
@@ -110,6 +110,8 @@ class Refinement:
                 self._learn(member, loop=far)
             turned = member.state == "placed" and self._headed(member)
             why = change.reason
+            if why and member.state == "waiting" and self.members.on_ground(member):
+                why = GROUNDED
             if why and (note := self.members.far_note(member.photo)):
                 why = f"{why}; {note}"
             self.members.save(member, about=about_record(member, why), reason=why)
