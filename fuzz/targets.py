@@ -227,6 +227,14 @@ def _pngs():
     ]
 
 
+def _webps():
+    told = {"exif": _exif(), "xmp": XMP}
+    return [
+        _saved(lambda b: Image.fromarray(_pixels()).save(b, "WEBP", **told)),
+        _saved(lambda b: Image.fromarray(_pixels(4)).save(b, "WEBP", lossless=True, **told)),
+    ]
+
+
 @cache
 def _clips():
     """An MP4 of two frames, with a camera model and a rotation in its tables."""
@@ -784,6 +792,7 @@ TARGETS = {
     "jpeg": Target(_photo(".jpg"), _jpegs, "jpeg"),
     "tiff": Target(_photo(".tif"), _tiffs, "tiff"),
     "png": Target(_photo(".png"), _pngs, "png"),
+    "webp": Target(_photo(".webp"), _webps, "webp"),
     "bands": Target(_bands, _bands_of_makers, "bands"),
     "mp4": Target(_container, _clips, "mp4"),
     "codec": Target(_codec, _descriptions, "codec"),

@@ -252,7 +252,7 @@ def same_folder(a: Path, b: Path) -> bool:
     return os.path.normcase(os.path.realpath(a)) == os.path.normcase(os.path.realpath(b))
 
 
-PHOTO_ENDINGS = (".jpg", ".jpeg", ".jpe", ".jfif", ".tif", ".tiff", ".png")
+PHOTO_ENDINGS = (".jpg", ".jpeg", ".jpe", ".jfif", ".tif", ".tiff", ".png", ".webp")
 """Endings of photos' files, in lower case."""
 _NOT_PHOTOS = frozenset(
     {"@eadir", "@recycle", "#recycle", "#snapshot", "$recycle.bin", "lost+found", "__macosx"}

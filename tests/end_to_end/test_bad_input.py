@@ -120,7 +120,7 @@ def renamed_text(path: Path) -> None:
         (garble, "damaged"),
         late(cut_but_ended, "damaged"),
         late(emptied, "0 bytes"),
-        late(renamed_text, "neither JPEG, TIFF nor PNG"),
+        late(renamed_text, "neither JPEG, TIFF, PNG nor WebP"),
     ],
 )
 def test_one_bad_photo_costs_that_photo_only(mosaic, photos, spoil, reason):

@@ -53,12 +53,12 @@ def test_photos_without_a_time_come_last_by_name(make_jpeg):
 
 def test_pictures_of_formats_that_are_not_read_are_told(make_jpeg):
     folder = flight(make_jpeg, 3)
-    for name in ("b.webp", "sub/c.HEIC", "p1.dng", "notes.txt", "Thumbs.db"):
+    for name in ("b.avif", "sub/c.HEIC", "p1.dng", "notes.txt", "Thumbs.db"):
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_bytes(b"x")
     (told,) = (n for n in read_survey(folder).notes if "format" in n)
-    assert told.startswith("2 pictures are not in the map") and "(b.webp, sub/c.HEIC)" in told
-    (folder / "b.webp").unlink()
+    assert told.startswith("2 pictures are not in the map") and "(b.avif, sub/c.HEIC)" in told
+    (folder / "b.avif").unlink()
     (folder / "sub/c.HEIC").unlink()  # a raw picture beside its JPEG is no loss
     assert not any("format" in n for n in read_survey(folder).notes)
 
@@ -283,11 +283,12 @@ def test_a_flight_at_height_zero_counts_from_sea_level_instead(make_jpeg):
     [
         (b"\0\0\0\x18ftypheic\0\0\0\0mif1heic", "a HEIC picture"),
         (b"\0\0\0\x1cftypavif", "an AVIF picture"),
-        (b"RIFF\x10\0\0\0WEBPVP8 ", "a WebP picture"),
+        (b"RIFF\x10\0\0\0WEBPVP8 ", "truncated"),
+        (b"RIFF\x10\0\0\0AVI LIST", "a film or sound"),
         (b"<html><body>403 forbidden", "a web page"),
         (b"version https://git-lfs.github.com/spec/v1", "Git LFS"),
         (bytes(5000), "interrupted copy"),
-        (b"something else", "neither JPEG, TIFF nor PNG"),
+        (b"something else", "neither JPEG, TIFF, PNG nor WebP"),
     ],
 )
 def test_other_content_under_the_name_of_a_photo_is_named(tmp_path, content, what):

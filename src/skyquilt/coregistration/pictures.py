@@ -84,7 +84,7 @@ def _shift(a: Photo, b: Photo, yaw_b_deg: float) -> np.ndarray:
     return np.array([right, -up])
 
 
-PHOTOS = (".jpg", ".jpeg", ".jpe", ".jfif", ".png")
+PHOTOS = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp")
 """Suffixes of files that may be photos although a file beside them places them like maps."""
 LONGEST = 2048
 """Largest size in px of the longer side at which a photo or map is registered; the output is

@@ -18,19 +18,12 @@ from pathlib import Path
 from skyquilt.errors import OutputError, UnreadablePhotoError
 from skyquilt.live.ledger import Ledger, hit
 from skyquilt.outside import is_folder, put_in_place
-from skyquilt.photos.headers import HEAD_BYTES, kind_of
+from skyquilt.photos.headers import HEAD_BYTES, Kind, kind_of
 from skyquilt.video.read import CLIP_ENDINGS
 from skyquilt.video.tracks import TRACK_ENDINGS
 
-ENDINGS = {
-    b"\xff\xd8\xff": ".jpg",
-    b"II*\x00": ".tif",
-    b"MM\x00*": ".tif",
-    b"II+\x00": ".tif",
-    b"MM\x00+": ".tif",
-    b"\x89PNG": ".png",
-}
-"""First bytes of the supported file formats, with the file extension."""
+ENDINGS: dict[Kind, str] = {"jpeg": ".jpg", "tiff": ".tif", "png": ".png", "webp": ".webp"}
+"""File extensions of the supported formats."""
 SEEN = "clips"
 """Folder, beside that of the photos, of what was seen of clips."""
 
@@ -51,7 +44,10 @@ class Arrived:
 
 def ending_of(head: bytes) -> str | None:
     """The file extension that matches a file's first bytes; None if it is not a photo."""
-    return next((end for magic, end in ENDINGS.items() if head.startswith(magic)), None)
+    try:
+        return ENDINGS[kind_of(head)]
+    except UnreadablePhotoError:
+        return None
 
 
 def is_clip(path: Path) -> bool:
@@ -91,7 +87,7 @@ class Inbox:
         """
         rest = iter(blocks)
         first = next(_read(rest), b"")
-        ending = {"jpeg": ".jpg", "tiff": ".tif", "png": ".png"}[kind_of(first[:HEAD_BYTES])]
+        ending = ENDINGS[kind_of(first[:HEAD_BYTES])]
         partial = self.folder / f"{time.monotonic_ns():x}-{os.getpid()}.partial"
         digest, size = hashlib.blake2b(digest_size=16), 0
         try:

@@ -10,7 +10,7 @@ from skyquilt.outside import is_folder, open_regular
 from skyquilt.photos.headers import PREVIEWS, RAW_PICTURES
 from skyquilt.photos.side_rows import sentence_of
 
-OTHER_PICTURES = (".avif", ".bmp", ".gif", ".heic", ".heif", ".jp2", ".jxl", ".webp")
+OTHER_PICTURES = (".avif", ".bmp", ".gif", ".heic", ".heif", ".jp2", ".jxl")
 """Endings of pictures in formats that are not read."""
 _UNREAD = frozenset(OTHER_PICTURES) | RAW_PICTURES
 """All endings of pictures that are not read."""

@@ -201,7 +201,7 @@ def has_end(file: BinaryIO, scan_offset: int) -> bool:
 
 
 Dtype = Literal["uint8", "uint16", "float32"]
-Kind = Literal["jpeg", "tiff", "png"]
+Kind = Literal["jpeg", "tiff", "png", "webp"]
 _WHOLE = 1 << 20
 _END = 1 << 18
 _TIFF_MAGIC = (b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+")
@@ -244,7 +244,11 @@ def read_header(path: Path, *, most_mp: float = MOST_MP) -> Header:
             kind = kind_of(file.read(HEAD_BYTES))
             if kind == "jpeg":
                 return _jpeg(file, most_mp)
-            from skyquilt.photos.lossless_headers import read_png, read_tiff  # most are JPEGs
+            if kind == "webp":
+                from skyquilt.photos.webp import read_webp  # most are JPEGs
+
+                return read_webp(file, most_mp)
+            from skyquilt.photos.lossless_headers import read_png, read_tiff
 
             return (read_tiff if kind == "tiff" else read_png)(file, most_mp)
     except UnreadablePhotoError:
@@ -278,7 +282,7 @@ def content_digest(path: Path) -> str:
 
 
 _OTHERS = {
-    b"RIFF": "a WebP picture",
+    b"RIFF": "a film or sound (RIFF)",
     b"GIF8": "a GIF picture",
     b"BM": "a BMP picture",
     b"%PDF": "a PDF document",
@@ -343,6 +347,8 @@ def kind_of(head: bytes) -> Kind:
         return "tiff"
     if head[:8] == b"\x89PNG\r\n\x1a\n":
         return "png"
+    if head[:4] == b"RIFF" and head[8:12] == b"WEBP":
+        return "webp"
     known = next((name for magic, name in _OTHERS.items() if head.startswith(magic)), "")
     if head[4:8] == b"ftyp":
         known = _BOXES.get(head[8:11], "a video or HEIF picture")
@@ -350,7 +356,7 @@ def kind_of(head: bytes) -> Kind:
         saved = "; save it as JPEG, TIFF or PNG with its metadata" if "picture" in known else ""
         saved = "; export its picture as a GeoTIFF" if known.endswith(_DATA) else saved
         raise UnreadablePhotoError(f"its content is {known}, whatever its name{saved}")
-    raise UnreadablePhotoError("its content is neither JPEG, TIFF nor PNG, whatever its name")
+    raise UnreadablePhotoError("its content is neither JPEG, TIFF, PNG nor WebP, whatever its name")
 
 
 def _jpeg(file: BinaryIO, most_mp: float) -> Header:

@@ -19,7 +19,7 @@ from skyquilt.errors import UnreadablePhotoError
 from skyquilt.model.photo import Photo
 from skyquilt.outside import open_regular
 from skyquilt.photos.detector_faults import repaired
-from skyquilt.photos.headers import content_digest, read_header
+from skyquilt.photos.headers import HEAD_BYTES, content_digest, kind_of, read_header
 from skyquilt.photos.tags import GDAL_METADATA, MAKE, MOST_XMP, Xmp, parse_xmp
 from skyquilt.photos.thermal import (
     linear_gain,
@@ -27,6 +27,7 @@ from skyquilt.photos.thermal import (
     thermal_frame_of_jpeg,
     thermal_frame_of_values,
 )
+from skyquilt.photos.webp import decode_webp
 from skyquilt.raster.fillings import without_fillings
 from skyquilt.video.decoder import frame_of
 
@@ -131,7 +132,7 @@ def _decode(photo: Photo, reduction: Reduction, *, gray: bool) -> Pixels:
         return reduce_pixels(to_gray(pixels) if gray else pixels, reduction)
     size = (photo.width, photo.height)
     with open_regular(photo.path) as file:
-        head = file.read(4)
+        head = file.read(HEAD_BYTES)
         file.seek(0)
         if head[:2] == b"\xff\xd8" and photo.unit:
             return reduce_pixels(_mended(_thermal_jpeg(photo.path), photo), reduction)
@@ -139,8 +140,13 @@ def _decode(photo: Photo, reduction: Reduction, *, gray: bool) -> Pixels:
             data = file.read()
             _same_size(simplejpeg.decode_jpeg_header(data)[1::-1], size)
             return decode_jpeg(data, gray=gray or photo.channels == 1, reduction=reduction)
-        if head == b"\x89PNG":
+        if head[:4] == b"\x89PNG":
             return reduce_pixels(_png(file, photo), reduction)
+        if kind_of(head) == "webp":
+            pixels = decode_webp(file, size)
+            if photo.alpha:
+                pixels = _emptied(pixels[..., :-1], pixels[..., -1])
+            return reduce_pixels(to_gray(pixels) if gray else pixels, reduction)
         pixels = read_tiff(file, size, scaled=bool(photo.unit), stored=photo.stored)
     if photo.channels == 1:
         pixels = pixels[..., 0]

@@ -124,7 +124,7 @@ def _text(name: str) -> str:
 def _sorted(
     files: Sequence[tuple[str, Path]], geo: Path | None, runs: tuple[str, ...]
 ) -> FoundFiles:
-    photos = sorted((n, p) for n, p in files if _is_photo(p))
+    photos = _once(sorted((n, p) for n, p in files if _is_photo(p)))
     clips = sorted((n, p) for n, p in files if p.suffix.lower() in CLIP_ENDINGS)
     known = {n for n, _ in (*photos, *clips)}
     beside = {p for _, clip in clips for p in side_files(clip)}
@@ -136,6 +136,22 @@ def _sorted(
     return FoundFiles(
         photos=tuple(photos), clips=tuple(clips), others=tuple(others), geo=geo, runs=runs
     )
+
+
+def _once(photos: Sequence[tuple[str, Path]]) -> list[tuple[str, Path]]:
+    """Names and files of photos, without a WebP that lies beside another photo of its name, as
+    programs write both.
+    """
+    usual = {path.with_suffix("") for _, path in photos if not _is_webp(path)}
+    return [
+        (name, path)
+        for name, path in photos
+        if not (_is_webp(path) and path.with_suffix("") in usual)
+    ]
+
+
+def _is_webp(path: Path) -> bool:
+    return path.suffix.lower() == ".webp"
 
 
 def _is_photo(path: Path) -> bool:

@@ -9,7 +9,7 @@ from fastapi.responses import FileResponse
 
 from skyquilt.live.inbox import ending_of
 from skyquilt.outside import open_regular
-from skyquilt.photos.headers import content_digest
+from skyquilt.photos.headers import HEAD_BYTES, content_digest
 from skyquilt.server.access import Context
 from skyquilt.server.shown import Shown, covering
 
@@ -19,13 +19,14 @@ Number = Annotated[int, Path(ge=0, le=2**53)]
 """The number of a photo."""
 KEPT = 10_000
 """Number of files whose verification is remembered."""
-_KINDS = {".jpg": "image/jpeg", ".png": "image/png", ".tif": "image/tiff"}
+_KINDS = {".jpg": "image/jpeg", ".tif": "image/tiff"}
+"""Media types by ending where they are called otherwise."""
 
 
 def _kind_of(found: Shown) -> str | None:
     assert found.path is not None
     with open_regular(found.path) as file:
-        ending = ending_of(file.read(8))
+        ending = ending_of(file.read(HEAD_BYTES))
         if ending is None:
             return None
         if content_digest(found.path) != found.digest:
@@ -35,7 +36,7 @@ def _kind_of(found: Shown) -> str | None:
                 whole.update(block)
             if whole.hexdigest() != found.digest:
                 return None
-    return _KINDS[ending]
+    return _KINDS.get(ending, f"image/{ending[1:]}")
 
 
 class PhotoEndpoints:

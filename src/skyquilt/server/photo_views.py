@@ -170,7 +170,7 @@ class PhotoViews:
 
 
 def _other(data: bytes) -> NDArray[np.uint8]:
-    """A TIFF or PNG as RGB; measured values stretched to 8 bits."""
+    """A TIFF, PNG or WebP as RGB; measured values stretched to 8 bits."""
     import io
 
     from PIL import Image
