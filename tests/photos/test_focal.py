@@ -93,8 +93,17 @@ def test_dewarp_data(make_jpeg):
         -0.0001,
     )
     assert (photo.focal.source, photo.focal.px) == ("calibrated", camera.focal)
-    flagged = dji_xmp(DewarpData=data, DewarpFlag="1")
-    assert read_photo(make_jpeg(image=pixels(120, 90), xmp=flagged)).calibration.k1 == 0
+
+
+def test_pictures_that_the_camera_undistorted_are_of_a_lens_of_their_own(make_jpeg):
+    """Beside others, one in four was adjusted with the others' distortion: 0.8 m off."""
+    data = "2018-09-04;75.0,75.3,2.0,-1.0,-0.26,0.11,0.0002,-0.0001,-0.05"
+    flat, bent = (
+        read_photo(make_jpeg(image=pixels(120, 90), xmp=dji_xmp(DewarpData=data, DewarpFlag=f)))
+        for f in "10"
+    )
+    assert flat.calibration.k1 == 0 != bent.calibration.k1
+    assert flat.camera_key == f"{bent.camera_key} undistorted"
 
 
 @pytest.mark.parametrize(

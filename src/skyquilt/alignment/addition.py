@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.determined import weak_photos
-from skyquilt.alignment.enlarged import NAMED
+from skyquilt.alignment import enlarged, stabilised
 from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.local_adjustment import LocalAdjustment, NotAdjusted
 from skyquilt.alignment.near_new import Block, adjusted_near, ground_near, window_of
@@ -41,8 +41,9 @@ def added(inputs: AlignmentInputs, bundle: Bundle) -> Alignment | None:
     former = inputs.former
     if former is None:
         raise ValueError("no earlier alignment is given")
-    if any(NAMED in name for name in former.camera_of.values()):
-        return None  # whether new photos are enlarged too, the whole tells
+    marks = enlarged.NAMED, stabilised.NAMED
+    if any(mark in name for name in former.camera_of.values() for mark in marks):
+        return None  # whether new photos are so, too, the whole tells
     aside = {i for i, p in former.poses.items() if tilt_deg(p.cam_R_map) > OBLIQUE_DEG}
     oblique = frozenset(reported_oblique(inputs.priors) - former.poses.keys())
     links = _of_photos(

@@ -33,6 +33,7 @@ from skyquilt.alignment.problem import Problem, State
 from skyquilt.alignment.repairs import begun_with, repaired
 from skyquilt.alignment.same_lens import as_of_sizes, lenses_of_sizes
 from skyquilt.alignment.setup import Setup, camera_records, pose_records, priors_by_camera, set_up
+from skyquilt.alignment.stabilised import as_stabilised, wandering
 from skyquilt.alignment.stages import fine_steps, plain, rough_steps, settled, spinning, weighed
 from skyquilt.alignment.start import Start, find_start, focals_by_heights, ground_of, with_focals
 from skyquilt.alignment.told_poses import believe_told
@@ -92,7 +93,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 97
+    version: ClassVar[int] = 98
 
     def __call__(
         self,
@@ -122,7 +123,8 @@ class Bundle:
             own = sized(begun)
             own = with_focals(own, begun.focals) if begun.focals else own
             own = as_of_lenses(own, begun.lenses) if begun.lenses else own
-            return as_enlarged(own, begun.enlarged) if begun.enlarged else own
+            own = as_enlarged(own, begun.enlarged) if begun.enlarged else own
+            return as_stabilised(own, begun.stabilised) if begun.stabilised else own
 
         def adjust(begun: Beginning) -> Alignment:
             upright = [k for k in links if not begun.aside & {k.a, k.b}]
@@ -246,7 +248,7 @@ class Bundle:
         sizes = [(p.width, p.height) for p in photos]
         large = len(start.placed) > self.many
         setup = set_up(photos, priors, start, distortion=self.distortion, repair=self.repair)
-        setup = uncentred(loosened(setup, begun.loose), begun.cut)
+        setup = wandering(uncentred(loosened(setup, begun.loose), begun.cut))
         begin = each = self.per_photo
         least = 0
         if large:

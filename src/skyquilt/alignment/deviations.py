@@ -69,7 +69,7 @@ def observed_noise(problem: Problem, state: State, size: Array) -> Noise:
     # the weights enter the normal equations; their variance and slope tell what these are worth
     variance = float((psi**2).sum()) / spare * float(w.mean()) / float((w**2).mean()) ** 2
     del w
-    near = max(_together(_part(problem, size, CELLS), psi), 0.0)
+    near = max(alike_within(_part(problem, size, CELLS), psi), 0.0)
     del psi
     hidden = (HIDDEN * np.maximum(size.max(1) / MATCHED, 1))[problem.photo]
     hidden /= problem.sigma_px
@@ -88,7 +88,7 @@ def likeness(problem: Problem, state: State, size: Array) -> Array:
     psi, _ = _weighted(problem, state)
     part, camera = _part(problem, size, CELLS), problem.camera[problem.photo]
     each = [camera == row for row in range(len(state.K))]
-    return np.array([_together(part[own], psi[own]) for own in each])
+    return np.array([alike_within(part[own], psi[own]) for own in each])
 
 
 def _weighted(problem: Problem, state: State) -> tuple[Array, Array]:
@@ -117,7 +117,7 @@ def _part(problem: Problem, size: Array, parts: int) -> NDArray[np.int64]:
     return out
 
 
-def _together(part: NDArray[np.int64], psi: Array) -> float:
+def alike_within(part: NDArray[np.int64], psi: Array) -> float:
     """Correlation of residuals (N, 2) of different points in the same one of the parts (N,)."""
     count = np.bincount(part).astype(float)
     pairs = float((count * (count - 1)).sum())

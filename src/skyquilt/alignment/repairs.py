@@ -36,6 +36,11 @@ from skyquilt.alignment.oblique_start import (
     untold,
 )
 from skyquilt.alignment.same_lens import sizes_note, unlike
+from skyquilt.alignment.stabilised import (
+    fits_stabilised,
+    stabilised_cameras,
+    stabilised_note,
+)
 from skyquilt.alignment.tries import Beginning, Survey, Tried
 from skyquilt.alignment.unfit_cameras import (
     cut_notes,
@@ -389,6 +394,23 @@ def _unfit_cameras(last: Tried, survey: Survey) -> Tried:
     return _freed(last, survey, cameras, fits_as_well, loose=cameras, name="unfit ")
 
 
+def _stabilised(last: Tried, survey: Survey) -> Tried:
+    """Photos that stabilisation cut out of larger pictures, each elsewhere, have axes of their own.
+    What was thought of their shutter and of where all of them were cut took the place of these.
+    """
+    cameras = stabilised_cameras(last.found, survey.cameras)
+    if not cameras:
+        return last
+    loose, cut = last.begun.loose - cameras, last.begun.cut - cameras
+    other = survey.tried(
+        last.begun, stabilised=cameras, loose=loose, cut=cut, name="stabilised "
+    )
+    if not fits_stabilised(other.found, last.found):
+        return last
+    note = stabilised_note(other.found, survey.cameras, cameras)
+    return replace(other, notes=(*last.notes, note))
+
+
 def _displaced_parts(last: Tried, survey: Survey) -> Tried:
     """Parts of the survey whose positions are displaced are brought together."""
     priors = last.begun.priors
@@ -450,6 +472,7 @@ REPAIRS: tuple[Callable[[Tried, Survey], Tried], ...] = (
     _false_focals,
     _held_in_the_middle,
     _unfit_cameras,
+    _stabilised,
     _displaced_parts,
 )
 """All repairs, in order: each relies on those before."""

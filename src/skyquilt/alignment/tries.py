@@ -32,6 +32,8 @@ class Beginning:
     """Cameras whose shutters and aspect ratios pictures alone tell."""
     cut: frozenset[str] = frozenset()
     """Cameras whose principal points pictures alone tell."""
+    stabilised: frozenset[str] = frozenset()
+    """Cameras each of whose photos shows another part of what the lens does."""
     in_space: Beginnings | None = None
     """Photos begin where they report to be, as those of an oblique survey do, or else here; None:
     where links of photos that look down put them.

@@ -287,10 +287,15 @@ def _dewarp(xmp: Xmp, size: tuple[int, int]) -> Camera | str | None:
         if len(numbers) != count or not all(math.isfinite(n) for n in numbers):
             found = found or f"it is not {count} finite numbers"
         elif any(numbers):
-            found = _dewarped(numbers, xmp.number("DewarpFlag") == 1, size)
+            found = _dewarped(numbers, already_undistorted(xmp), size)
         if isinstance(found, Camera):
             break
     return found
+
+
+def already_undistorted(xmp: Xmp) -> bool:
+    """Whether the camera took the distortion of its lens out of the picture (DJI's `DewarpFlag`)."""
+    return xmp.number("DewarpFlag") == 1
 
 
 def _dewarped(numbers: Sequence[float], flat: bool, size: tuple[int, int]) -> Camera | str:

@@ -21,6 +21,7 @@ from skyquilt.photos.flir import MOST_THERMAL_MP
 from skyquilt.photos.headers import Header, content_digest, read_header
 from skyquilt.photos.lens import (
     Sensor,
+    already_undistorted,
     digital_zoom,
     find_focal,
     find_sensor,
@@ -355,6 +356,7 @@ def _camera_key(header: Header, width: int, height: int, zoom: float) -> str:
         f"{width}x{height}",
         f"{mm:.1f}mm" if mm else "",
         f"zoom {zoom:g}" if zoom > 1 else "",
+        "undistorted" if already_undistorted(xmp) else "",
     )
     return " ".join(" ".join(p.lower().split()) for p in parts if p)
 
