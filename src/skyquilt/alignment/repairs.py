@@ -36,11 +36,7 @@ from skyquilt.alignment.oblique_start import (
     untold,
 )
 from skyquilt.alignment.same_lens import sizes_note, unlike
-from skyquilt.alignment.stabilised import (
-    fits_stabilised,
-    stabilised_cameras,
-    stabilised_note,
-)
+from skyquilt.alignment.stabilised import fits_stabilised, stabilised_cameras, stabilised_note
 from skyquilt.alignment.tries import Beginning, Survey, Tried
 from skyquilt.alignment.unfit_cameras import (
     cut_notes,
@@ -402,10 +398,8 @@ def _stabilised(last: Tried, survey: Survey) -> Tried:
     if not cameras:
         return last
     loose, cut = last.begun.loose - cameras, last.begun.cut - cameras
-    other = survey.tried(
-        last.begun, stabilised=cameras, loose=loose, cut=cut, name="stabilised "
-    )
-    if not fits_stabilised(other.found, last.found):
+    other = survey.tried(last.begun, stabilised=cameras, loose=loose, cut=cut, name="stabilised ")
+    if not fits_stabilised(other.found, last.found, survey.cameras):
         return last
     note = stabilised_note(other.found, survey.cameras, cameras)
     return replace(other, notes=(*last.notes, note))

@@ -21,12 +21,13 @@ from skyquilt.model.poses import Alignment
 
 FEWEST = 6
 """Photos of a camera at least: of fewer, places of axes take up too much else."""
-ALIKE = 0.17
+ALIKE = 0.18
 """Residuals of neighbours in a photo that correlate so much may be left by parts cut elsewhere;
-real flights without any have 0.15 at most, parts 1 % of the width elsewhere 0.2.
+three real flights without any have 0.17 at most, parts 1 to 4 % of the width elsewhere 0.19 and
+more.
 """
-BETTER = 0.85
-"""Places of their own are taken where the mean residual falls below this share: 0.54 to 0.74 where
+BETTER = 0.92
+"""Places of their own are taken where the mean residual falls below this share: 0.54 to 0.90 where
 parts lie 1 to 4 % of the width elsewhere, 0.97 and more on real flights without any.
 """
 KEPT = 0.99
@@ -96,9 +97,13 @@ def wandering(setup: Setup) -> Setup:
     return replace(setup, base=replace(setup.base, sigma_K=sigma))
 
 
-def fits_stabilised(other: Alignment, found: Alignment) -> bool:
-    """Whether an alignment with an axis of its own for each photo fits the pictures much better."""
-    return fits_better(other, found, kept=KEPT, share=BETTER)
+def fits_stabilised(other: Alignment, found: Alignment, cameras: Sequence[str]) -> bool:
+    """Whether an alignment with an axis of its own for each photo fits the pictures much better,
+    and leaves no residuals that are alike: several lenses under one name still do. `cameras`:
+    names, of each photo, without stabilisation.
+    """
+    better = fits_better(other, found, kept=KEPT, share=BETTER)
+    return better and not stabilised_cameras(other, cameras)
 
 
 def stabilised_note(found: Alignment, cameras: Sequence[str], stabilised: Collection[str]) -> str:
