@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import norm
 
 from skyquilt.alignment import unlike_lenses
-from skyquilt.alignment.unlike_lenses import Bent, as_of_lenses, bent, lenses_note
+from skyquilt.alignment.unlike_lenses import Bent, as_of_lenses, bent, lenses_note, named_lenses
 from skyquilt.model.poses import TiePoints
 from tests.alignment.blocks import LENS
 from tests.alignment.surveys import FOCAL, HEIGHT, WIDTH, alignment, photo
@@ -43,6 +43,34 @@ def test_photos_of_a_second_lens_are_calibrated_by_themselves(second, k1):
     C = np.array([found.poses[i].map_C for i in range(24)])
     off = C - flown.truth.C
     assert np.linalg.norm(off - off.mean(0), axis=1).max() < 0.5
+
+
+@pytest.mark.slow
+def test_lenses_of_a_rig_are_told_by_names():
+    """Three cameras of one model: two groups do not hold them apart."""
+    flown = Flown(1, lines=4, per_line=6, points=900)
+    letter = ["ABC"[i % 3] for i in range(24)]
+    for k, name in enumerate("ABC"):
+        bend(flown, [i for i in range(24) if letter[i] == name], 0.03 * k)
+    flown.photos = [
+        replace(p, name=f"DJI_{a}_{i:04d}.jpg")
+        for i, (p, a) in enumerate(zip(flown.photos, letter, strict=True))
+    ]
+    found = flown.aligned()
+    assert sum("through another lens" in n for n in found.notes) == 1
+    k1 = {a: found.camera(i).k1 for i, a in enumerate(letter)}
+    assert k1["B"] - k1["A"] == pytest.approx(0.03, rel=0.2)
+    assert k1["C"] - k1["A"] == pytest.approx(0.06, rel=0.2)
+    assert len({found.camera_of[i] for i in range(24)}) == 3
+
+
+def test_names_and_folders_that_may_tell_lenses():
+    names = [f"{a}/DJI_{i:03d}.jpg" for a in ("1", "2") for i in range(3)]
+    assert named_lenses(names, ["cam"] * 6, {"cam"}) == dict(enumerate((0, 0, 0, 1, 1, 1)))
+    assert named_lenses(names, ["cam"] * 6, ()) == {}
+    assert named_lenses([n.split("/")[1] for n in names], ["cam"] * 6, {"cam"}) == {}
+    lone = [*names, "3/DJI_004.jpg"]
+    assert named_lenses(lone, ["cam"] * 7, {"cam"}) == {}
 
 
 @pytest.mark.slow

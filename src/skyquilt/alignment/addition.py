@@ -12,9 +12,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment import enlarged, stabilised
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.determined import weak_photos
-from skyquilt.alignment import enlarged, stabilised
 from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.local_adjustment import LocalAdjustment, NotAdjusted
 from skyquilt.alignment.near_new import Block, adjusted_near, ground_near, window_of

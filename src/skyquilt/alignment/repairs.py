@@ -45,7 +45,13 @@ from skyquilt.alignment.unfit_cameras import (
     focal_notes,
     unfit_notes,
 )
-from skyquilt.alignment.unlike_lenses import fits_lenses, lenses_note, unlike_lenses
+from skyquilt.alignment.unlike_lenses import (
+    alike_cameras,
+    fits_lenses,
+    lenses_note,
+    named_lenses,
+    unlike_lenses,
+)
 from skyquilt.errors import AlignmentError
 from skyquilt.model.poses import Alignment, Prior
 
@@ -225,7 +231,16 @@ def _enlargements(last: Tried, survey: Survey) -> Tried:
 
 
 def _unlike_lenses(last: Tried, survey: Survey) -> Tried:
-    """Photos of two lenses that files tell to be of one camera are calibrated by themselves."""
+    """Photos of several lenses that files tell to be of one camera are calibrated by themselves: as
+    their names tell, or else of two lenses as these bend them.
+    """
+    if named := named_lenses(
+        survey.names, survey.cameras, alike_cameras(last.found, survey.cameras)
+    ):
+        other = survey.tried(last.begun, lenses=named, name="named lenses ")
+        if fits_lenses(other.found, last.found, {}):
+            note = lenses_note(named, survey.cameras, survey.names)
+            return replace(other, notes=(*last.notes, note))
     best = last
     for again in range(LENSES_AGAIN):
         before = best.begun.lenses

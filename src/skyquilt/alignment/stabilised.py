@@ -11,21 +11,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from skyquilt.alignment.deviations import CELLS, alike_within
 from skyquilt.alignment.enlarged import fits_better
 from skyquilt.alignment.same_lens import MOST_SIZES
 from skyquilt.alignment.setup import Setup
 from skyquilt.alignment.unfit_cameras import CX, CY
+from skyquilt.alignment.unlike_lenses import alike_cameras
 from skyquilt.model.photo import Photo, Zoom
 from skyquilt.model.poses import Alignment
 
 FEWEST = 6
 """Photos of a camera at least: of fewer, places of axes take up too much else."""
-ALIKE = 0.18
-"""Residuals of neighbours in a photo that correlate so much may be left by parts cut elsewhere;
-three real flights without any have 0.17 at most, parts 1 to 4 % of the width elsewhere 0.19 and
-more.
-"""
 BETTER = 0.92
 """Places of their own are taken where the mean residual falls below this share: 0.54 to 0.90 where
 parts lie 1 to 4 % of the width elsewhere, 0.97 and more on real flights without any.
@@ -44,24 +39,10 @@ def stabilised_cameras(found: Alignment, cameras: Sequence[str]) -> frozenset[st
     """Names of cameras each of whose photos may be another part of what the lens shows, as
     residuals of neighbours tell. `cameras`: names, of each photo.
     """
-    shown = set[str]()
-    ties = found.ties
-    for name in dict.fromkeys(cameras[i] for i in found.held):
-        own = [i for i in found.held if cameras[i] == name]
-        if not FEWEST <= len(own) <= MOST_SIZES:
-            continue
-        parts, residuals = [], []
-        for i, rows in ties.of_photos(own).items():
-            size = found.camera(i).width, found.camera(i).height
-            column, row = np.clip(ties.px[rows] / size * CELLS, 0, CELLS - 1).astype(int).T
-            parts.append((i * CELLS + row) * CELLS + column)
-            residuals.append(ties.residual_px[rows])
-        off = np.concatenate(residuals).astype(np.float64)
-        length = np.linalg.norm(off, axis=1)
-        weight = 1 / (1 + (length / (2 * np.median(length) + 1e-12)) ** 2)
-        if alike_within(np.concatenate(parts), off * weight[:, None]) > ALIKE:
-            shown.add(name)
-    return frozenset(shown)
+    number = Counter(cameras[i] for i in found.held)
+    return frozenset(
+        name for name in alike_cameras(found, cameras) if FEWEST <= number[name] <= MOST_SIZES
+    )
 
 
 def as_stabilised(photos: Sequence[Photo], cameras: Collection[str]) -> list[Photo]:

@@ -25,7 +25,7 @@ class Beginning:
     enlarged: Mapping[int, float] = field(default_factory=dict)
     """Factors of photos that are enlarged against others of their camera."""
     lenses: Mapping[int, int] = field(default_factory=dict)
-    """The lens, 0 or 1, of photos of cameras that have two."""
+    """The lens, 0 and up, of photos of cameras that have several."""
     focals: Mapping[str, float] = field(default_factory=dict)
     """Factors of focal lengths that are guessed or not believed, by camera."""
     loose: frozenset[str] = frozenset()

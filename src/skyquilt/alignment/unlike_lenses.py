@@ -6,12 +6,16 @@ then grows with the third power of the distance from its middle, outwards for on
 other. Places and angles of photos cannot make up for that.
 """
 
-from collections.abc import Mapping, Sequence
+import re
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.deviations import CELLS, alike_within
 from skyquilt.alignment.enlarged import FEWEST, fits_better, misfit_px
 from skyquilt.model.camera import Camera
 from skyquilt.model.photo import Photo, evenly
@@ -39,6 +43,13 @@ BETTER = 0.92
 """Two lenses are taken where the mean residual falls below this share: an error of a lens model
 that all photos share lets it fall by less.
 """
+ALIKE = 0.18
+"""Residuals of neighbours in a photo that correlate so much may be left by other lenses: three real
+flights of one lens have 0.17 at most, parts cut 1 to 4 % of the width elsewhere 0.19 and more, five
+lenses of a rig under one name 0.45.
+"""
+MOST_NAMED = 12
+"""Groups of names that may stand for a lens each, at most."""
 NAMED = "lens"
 """In the name of the second camera."""
 
@@ -62,6 +73,51 @@ def unlike_lenses(
             group = _two_groups(*bent(found, own))
         out |= group
     return out
+
+
+def alike_cameras(found: Alignment, cameras: Sequence[str]) -> frozenset[str]:
+    """Names of cameras whose photos one lens may not fit, since residuals of neighbours are alike.
+    `cameras`: names, of each photo.
+    """
+    shown = set[str]()
+    for name in dict.fromkeys(cameras[i] for i in found.held):
+        parts, residuals = [], []
+        own = [i for i in found.held if cameras[i] == name]
+        for i, rows in found.ties.of_photos(own).items():
+            size = found.camera(i).width, found.camera(i).height
+            cell = np.clip(found.ties.px[rows] / size * CELLS, 0, CELLS - 1).astype(np.int64)
+            parts.append((i * CELLS + cell[:, 1]) * CELLS + cell[:, 0])
+            residuals.append(found.ties.residual_px[rows])
+        off = np.concatenate([np.zeros((0, 2)), *residuals])
+        if not len(off):
+            continue
+        length = np.linalg.norm(off, axis=1)
+        weight = 1 / (1 + (length / (2 * np.median(length) + 1e-12)) ** 2)
+        if alike_within(np.concatenate(parts), off * weight[:, None]) > ALIKE:
+            shown.add(name)
+    return frozenset(shown)
+
+
+def named_lenses(
+    names: Sequence[str], cameras: Sequence[str], doubtful: Collection[str]
+) -> dict[int, int]:
+    """The lens, 0 and up, of each photo (index) of doubtful cameras (names) by its folder and by
+    what its name has beside numbers, where these make groups: rigs of several cameras of one model.
+    """
+    out = dict[int, int]()
+    for camera in sorted(doubtful):
+        kinds = {i: _kind(names[i]) for i, name in enumerate(cameras) if name == camera}
+        number = Counter(kinds.values())
+        if 2 <= len(number) <= MOST_NAMED and min(number.values()) >= FEWEST:
+            order = sorted(number, key=lambda kind: (-number[kind], kind))
+            out |= {i: order.index(kind) for i, kind in kinds.items()}
+    return out
+
+
+def _kind(name: str) -> tuple[str, str]:
+    """The folder of a file, and its name without numbers."""
+    path = PurePosixPath(name)
+    return str(path.parent), re.sub(r"[0-9]+", "#", path.stem)
 
 
 def as_of_lenses(photos: Sequence[Photo], lenses: Mapping[int, int]) -> list[Photo]:
@@ -93,7 +149,8 @@ def lenses_note(lenses: Mapping[int, int], cameras: Sequence[str], names: Sequen
         said.append(f"{len(second)} of {len(own)} of {camera} ({sentence_of(second)})")
     return (
         "Some photos were taken through another lens than others of their camera, as their"
-        " overlaps show (two drones of one model, or a program that corrected the distortion):"
+        " overlaps show (drones or cameras of one model, or a program that corrected the"
+        " distortion):"
         f" {'; '.join(said)}. They are calibrated by themselves."
     )
 

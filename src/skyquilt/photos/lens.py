@@ -294,7 +294,7 @@ def _dewarp(xmp: Xmp, size: tuple[int, int]) -> Camera | str | None:
 
 
 def already_undistorted(xmp: Xmp) -> bool:
-    """Whether the camera took the distortion of its lens out of the picture (DJI's `DewarpFlag`)."""
+    """Whether the camera took the distortion out of the picture (DJI's `DewarpFlag`)."""
     return xmp.number("DewarpFlag") == 1
 
 
