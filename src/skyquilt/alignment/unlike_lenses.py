@@ -48,6 +48,8 @@ ALIKE = 0.18
 flights of one lens have 0.17 at most, parts cut 1 to 4 % of the width elsewhere 0.19 and more, five
 lenses of a rig under one name 0.45.
 """
+MOST_LOOKED = 300
+"""Photos of a camera whose residuals are compared, at most."""
 MOST_NAMED = 12
 """Groups of names that may stand for a lens each, at most."""
 NAMED = "lens"
@@ -83,6 +85,7 @@ def alike_cameras(found: Alignment, cameras: Sequence[str]) -> frozenset[str]:
     for name in dict.fromkeys(cameras[i] for i in found.held):
         parts, residuals = [], []
         own = [i for i in found.held if cameras[i] == name]
+        own = [own[k] for k in evenly(len(own), MOST_LOOKED)]
         for i, rows in found.ties.of_photos(own).items():
             size = found.camera(i).width, found.camera(i).height
             cell = np.clip(found.ties.px[rows] / size * CELLS, 0, CELLS - 1).astype(np.int64)
