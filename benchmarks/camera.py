@@ -128,6 +128,8 @@ def main() -> int:
     if args.list:
         print("\n".join(KINDS))
         return 0
+    if unknown := [kind for kind in args.kinds if kind not in KINDS]:
+        parser.error(f"there is no kind {unknown[0]}; --list names them")
     extra = dict(text.split("=", 1) for text in args.option)
     rows = []
     for kind in args.kinds:
