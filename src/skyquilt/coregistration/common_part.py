@@ -14,7 +14,7 @@ from skyquilt.model.registration import Guess, Matrix, Picture, RefusedRegistrat
 
 _WHOLE = 0.7
 """If the shared part is more than this share of an image, the whole image is used."""
-_LEAST_PX = 96
+LEAST_PX = 96
 """If the shorter side of a part has fewer px, the whole images are used."""
 
 
@@ -83,7 +83,7 @@ def _window(
     low = np.clip(np.floor(px.min(0) - margin), 0, [target[1], target[0]]).astype(int)
     high = np.clip(np.ceil(px.max(0) + margin), 0, [target[1], target[0]]).astype(int)
     size = high - low
-    if size.min() < _LEAST_PX or size.prod() > _WHOLE * target[0] * target[1]:
+    if size.min() < LEAST_PX or size.prod() > _WHOLE * target[0] * target[1]:
         return everything
     return slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from skyquilt import registry
 from skyquilt.coregistration.auto import Auto
 from skyquilt.coregistration.marks import WithoutMarks
+from skyquilt.coregistration.points import PointMatches
 from skyquilt.coregistration.shapes import ShapeMatches
 from skyquilt.coregistration.structure import Structure, StructureMatches
 from skyquilt.errors import UsageError
@@ -17,6 +18,10 @@ SAMPLES = 1000
 """Most samples drawn for a similarity: enough for 7 % of right matches."""
 INLIERS = 9
 """Fewest inliers of an accepted registration by the thesis's methods [Y 6.4.1]."""
+
+
+POINTS = 6
+"""The same of a place by points of one spectrum, which is then tried like any other."""
 
 
 STATING = ("auto", "structure", "shapes", "rfae-refined")
@@ -65,12 +70,12 @@ def registration_method(name: str) -> Registers:
 
 def auto() -> WithoutMarks:
     """Orientation correlation, helped by structure matches, verified by patches."""
-    return WithoutMarks(method=Auto(propose=_proposals()))
+    return WithoutMarks(method=Auto(propose=_proposals(), points=_points()))
 
 
 def near_guess() -> WithoutMarks:
     """The same near a guess only, for pictures that are known to lie within its reach."""
-    return WithoutMarks(method=Auto(propose=_proposals(), beyond=False))
+    return WithoutMarks(method=Auto(propose=_proposals(), points=_points(), beyond=False))
 
 
 def structure() -> WithoutMarks:
@@ -81,6 +86,14 @@ def structure() -> WithoutMarks:
 def shapes() -> WithoutMarks:
     """Areas and objects as shapes, verified by patches."""
     return WithoutMarks(method=Structure(propose=ShapeMatches()))
+
+
+def _points() -> PointMatches:
+    return PointMatches(
+        estimate=Ransac(
+            model="similarity", minimum=POINTS, threshold_px=4.0, max_iterations=5 * SAMPLES
+        )
+    )
 
 
 def _proposals() -> StructureMatches:

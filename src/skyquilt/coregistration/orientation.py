@@ -199,13 +199,15 @@ def warped(a: Orientation, b_H_a: Matrix, shape: tuple[int, int]) -> tuple[Field
 
 
 def turned(fields: Fields, angle: float) -> Fields:
-    """Fields with orientations rotated by an angle in radians (x towards y); pixels are not
-    moved.
+    """Fields (h, w, 4), or the first of both alone (h, w, 2), with orientations rotated by an angle
+    in radians (x towards y); pixels are not moved.
     """
     turn = np.exp(np.array([2j, 4j]) * angle).astype(np.complex64)
     both = np.ascontiguousarray(fields).view(np.complex64)
     out = np.empty_like(both)
-    for k in range(2):  # whole pictures one after the other take two thirds of the time of pairs
+    for k in range(
+        both.shape[-1]
+    ):  # whole pictures one after the other take two thirds of the time of pairs
         np.multiply(both[..., k], turn[k], out=out[..., k])
     return out.view(np.float32)
 
