@@ -8,11 +8,13 @@ import pytest
 from scipy import stats
 
 from skyquilt.coregistration.agreement import Agree, _fisher
+from skyquilt.coregistration.auto import Within
 from skyquilt.coregistration.candidates import (
     Candidate,
     Nearby,
     corners,
     distinct,
+    middle,
     peaks,
     same_view,
     similarity,
@@ -139,6 +141,32 @@ def test_a_part_is_found_in_every_corner_of_the_whole(corner):
     best = distinct(search(part, whole), part.shape, 3, 3)
     off = [corners(c.b_H_a, part.shape) - corners(truth, part.shape) for c in best]
     assert min(np.linalg.norm(o, axis=1).max() for o in off) < 5
+
+
+def test_the_first_field_alone_is_correlated():
+    a, b = (of(p, 48.0) for p in pair(np.eye(3), seed=6))
+    plane = _Plane.of(a, b, parts=2)
+    field = plane.correlations(a, 1.0, 0.3)[0][1]
+    half = np.pi / 2
+    for x, y in ((0, 0), (4, plane.side - 8)):
+        to = similarity(1.0, 0.3 + half, middle(a.shape), plane.place(x, y, 1))
+        moved = warped(a, to, b.shape)[0]
+        direct = (moved * b.fields)[..., :2].sum(dtype=float)
+        assert field[y, x] == pytest.approx(direct, abs=0.03 * float(np.abs(field).max()))
+
+
+@pytest.mark.parametrize(
+    ("shape", "scales"),
+    [
+        ((960, 1200), (1 / 8, 1 / 4)),  # all of them
+        ((600, 800), (96 / 600, 1 / 4)),  # a part of 96 px is the least
+        ((450, 800), None),  # hardly any
+    ],
+)
+def test_parts_with_too_few_pixels_are_not_searched(shape, scales):
+    way = Within(times=5.0, least_px=96, search=Everywhere(smallest=1 / 8, largest=1 / 4))
+    search = way.fitting(shape)
+    assert (search and (search.smallest, search.largest)) == scales
 
 
 def test_nearby_finds_what_lies_near_a_guess():
