@@ -49,7 +49,9 @@ class Everywhere:
     per_turn: int = 2
     """Number of peaks kept for each rotation and scale."""
     first_only: bool = False
-    """Whether the first field (`Orientation.fields`) is correlated alone, in four fifths of the time."""
+    """Whether the first field (`Orientation.fields`) is correlated alone, which takes four fifths
+    of the time.
+    """
     version: ClassVar[int] = 3
 
     def __call__(self, a: Orientation, b: Orientation) -> list[Candidate]:
