@@ -205,9 +205,7 @@ def turned(fields: Fields, angle: float) -> Fields:
     turn = np.exp(np.array([2j, 4j]) * angle).astype(np.complex64)
     both = np.ascontiguousarray(fields).view(np.complex64)
     out = np.empty_like(both)
-    for k in range(
-        both.shape[-1]
-    ):  # whole pictures one after the other take two thirds of the time of pairs
+    for k in range(both.shape[-1]):  # one after the other: two thirds of the time of pairs
         np.multiply(both[..., k], turn[k], out=out[..., k])
     return out.view(np.float32)
 
